@@ -1,0 +1,63 @@
+"""The command line: ``caper <command> ...`` or ``python -m caper_jax <command> ...``."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from caper_jax._version import __version__
+from caper_jax.cli import common
+from caper_jax.errors import unknown_name
+
+# Command -> one line for --help; the module of the same name holds it, imported only when it runs.
+COMMANDS = {
+    "demo": "estimate poses on the depth frames that ship with the package",
+    "estimate": "estimate poses from your own depth image or point cloud",
+    "generate": "write synthetic labelled data",
+    "train": "train a category's networks, or resume a run",
+    "evaluate": "measure a model on labelled data",
+}
+
+EXAMPLES = """\
+examples:
+  caper demo                        pictures and a page in outputs/demo
+  caper train --help                options and examples of one command
+"""
+
+
+def help_text() -> str:
+    """What ``caper --help`` prints."""
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items()]
+    return (
+        "usage: caper <command> [options]\n\n"
+        "Poses of articulated objects (boxes, laptops, ...) from a single depth image.\n\n"
+        "commands:\n" + "\n".join(lines) + "\n\noptions:\n"
+        "  -h, --help  show this text\n"
+        "  --version   show the version\n\n" + EXAMPLES
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs ``caper``; returns the exit code (0, 2 for a mistake of the user, 130 for Ctrl-C)."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments:
+        print(help_text(), end="", file=sys.stderr)
+        return common.EXIT_USAGE
+    command, rest = arguments[0], arguments[1:]
+    if command in ("-h", "--help", "help"):
+        print(help_text(), end="")
+        return 0
+    if command == "--version":
+        print(f"caper-jax {__version__}")
+        return 0
+    if command not in COMMANDS:
+        print(f"caper: error: {unknown_name('command', command, COMMANDS)}", file=sys.stderr)
+        return common.EXIT_USAGE
+
+    def start(command_argv: Sequence[str]) -> int:
+        # Imported inside run, so that Ctrl-C during a slow import is reported like any other.
+        return importlib.import_module(f"caper_jax.cli.{command}").main(command_argv)
+
+    return common.run(start, rest, command=command)
