@@ -1,0 +1,62 @@
+"""Forward kinematics of a part tree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from caper_jax.articulation.joints import joint_transform
+from caper_jax.errors import CaperError
+from caper_jax.geometry import se3, so3
+
+
+def forward_kinematics(
+    root: ArrayLike,
+    axis: ArrayLike,
+    pivot: ArrayLike,
+    state: ArrayLike,
+    joint_types: Sequence[str],
+    parents: Sequence[int],
+) -> jax.Array:
+    """Poses of all K = J + 1 parts: ``T_k = T_parent(k) J_k(state_k)``.
+
+    Axes and pivots are given in the root's canonical frame at rest. At rest every part shares the
+    root's pose, so the same numbers hold in the parent's frame, however deep the tree.
+
+    Args:
+      root: [..., 4, 4] pose of part 0, canonical frame -> camera.
+      axis: [..., J, 3] unit joint axes.
+      pivot: [..., J, 3] metres; points on the axes.
+      state: [..., J] radians (revolute) or metres (prismatic) from the rest pose.
+      joint_types: J times "revolute" or "prismatic"; joint j carries part j + 1.
+      parents: J parent parts; a parent comes before its child.
+
+    Returns:
+      [..., K, 4, 4].
+
+    Raises:
+      CaperError: unknown joint type, or counts or parents that make no tree.
+    """
+    joints = len(joint_types)
+    if len(parents) != joints:
+        raise CaperError(f"joint_types names {joints} joints, parents {len(parents)}")
+    for joint, parent in enumerate(parents):
+        if not 0 <= parent <= joint:
+            raise CaperError(
+                f"parents[{joint}] = {parent}: part {joint + 1} needs a parent among parts "
+                f"0 to {joint}"
+            )
+    root = so3.as_floating(root, (4, 4), "root")
+    axis = so3.as_floating(axis, (joints, 3), "axis")
+    pivot = so3.as_floating(pivot, (joints, 3), "pivot")
+    state = so3.as_floating(state, (joints,), "state")
+    poses = [root]
+    for joint, (joint_type, parent) in enumerate(zip(joint_types, parents, strict=True)):
+        motion = joint_transform(
+            joint_type, axis[..., joint, :], pivot[..., joint, :], state[..., joint]
+        )
+        poses.append(se3.compose(poses[parent], motion))
+    return jnp.stack(jnp.broadcast_arrays(*poses), axis=-3)

@@ -1,0 +1,23 @@
+"""Tests run on the CPU, seen by JAX as eight devices; float64 only inside ``jax.enable_x64``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+# Before anything imports jax: a GPU would be slower here, and round differently.
+os.environ["JAX_PLATFORMS"] = "cpu"
+
+import jax
+import pytest
+
+jax.config.update("jax_num_cpu_devices", 8)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of real sample data beside the repository; the test is skipped where absent."""
+    folder = Path(__file__).resolve().parents[2] / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"no sample data at {folder}")
+    return folder
