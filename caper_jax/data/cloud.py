@@ -1,0 +1,255 @@
+"""Point clouds of a fixed number of points, from depth images and from files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from caper_jax.data.images import read_array
+from caper_jax.errors import CaperError
+
+MIN_POINTS = 16
+# Beyond this depth (metres) a cloud is taken for one in millimetres.
+_FARTHEST_M = 50.0
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points picked from a depth image or a larger cloud, in the order of the source.
+
+    Attributes:
+      points: [N, 3] float32 metres, camera frame.
+      pixels: [N, 2] int32 (v, u) of every point; None when the source is no image.
+      index: [N] int64 row of every point among the source's usable points; None for an image.
+      available: number of usable points in the source; fewer than N means repeated points.
+      dropped: number of points or masked pixels left out: no measurement, or too far away.
+    """
+
+    points: np.ndarray
+    pixels: np.ndarray | None
+    index: np.ndarray | None
+    available: int
+    dropped: int
+
+
+def systematic_indices(available: int, num_points: int, seed: int | None = None) -> np.ndarray:
+    """Evenly spread picks ``floor((i + u) n / N)``: no sort, no repeat unless n < N.
+
+    Args:
+      available: n, number of points to pick from, in raster order.
+      num_points: N, number of picks.
+      seed: draws u from [0, 1); None takes u = 1/2.
+
+    Returns:
+      [N] int64 in 0..n-1, ascending; every point is picked floor(N/n) or ceil(N/n) times.
+    """
+    offset = 0.5 if seed is None else np.random.default_rng(seed).random()
+    ranks = (np.arange(num_points) + offset) * available / num_points
+    return np.minimum(ranks.astype(np.int64), available - 1)
+
+
+def cloud_from_depth(
+    depth: np.ndarray,
+    mask: np.ndarray,
+    intrinsics: np.ndarray,
+    num_points: int = 1024,
+    seed: int | None = None,
+    radius: float | None = None,
+) -> Cloud:
+    """Back-projects the masked pixels and picks ``num_points`` of them in raster order.
+
+    Args:
+      depth: [H, W] metres; zero, NaN and infinity are dropped and counted.
+      mask: [H, W], nonzero on the object.
+      intrinsics: [3, 3] pinhole matrix, pixels.
+      num_points: points to return; fewer usable pixels are repeated evenly.
+      seed: see ``systematic_indices``.
+      radius: metres; when given, points farther than this from the median point are dropped and
+        counted (background that leaks through the rim of a mask).
+
+    Returns:
+      The cloud, with the pixel of every point.
+
+    Raises:
+      CaperError: images of different size, an empty mask, no valid depth under it, or fewer than
+        16 usable points.
+    """
+    depth, mask = np.asarray(depth), np.asarray(mask)
+    if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.floating):
+        raise CaperError(
+            f"depth must be a float image [H, W] in metres, got {depth.dtype} {depth.shape}"
+        )
+    if mask.shape != depth.shape:
+        raise CaperError(
+            f"depth is {_size(depth)} but mask is {_size(mask)}; both must come from the same "
+            "(aligned) image"
+        )
+    rows, columns = np.nonzero(mask)
+    if not len(rows):
+        raise CaperError("the mask is empty; no object to estimate")
+    z = depth[rows, columns].astype(np.float32)
+    valid = np.isfinite(z) & (z > 0)
+    if not valid.any():
+        raise CaperError(
+            f"none of the {len(rows)} masked pixels has valid depth (all zero or NaN); the object "
+            "is too close, too far or reflective, or mask and depth do not belong together"
+        )
+    points = back_project(rows[valid], columns[valid], z[valid], intrinsics)
+    pixels = np.stack([rows[valid], columns[valid]], axis=-1).astype(np.int32)
+    if radius is not None:
+        near = _near(points, radius)
+        points, pixels = points[near], pixels[near]
+    _check_count(len(points), f"of {len(rows)} masked pixels")
+    picked = systematic_indices(len(points), num_points, seed)
+    dropped = len(rows) - len(points)
+    return Cloud(points[picked], pixels[picked], None, len(points), dropped)
+
+
+def back_project(
+    rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray
+) -> np.ndarray:
+    """[..., 3] float32 camera points of pixels (row v, column u) at ``depth``, metres."""
+    intrinsics = np.asarray(intrinsics, np.float64)
+    if intrinsics.shape != (3, 3):
+        raise CaperError(f"intrinsics must be [3, 3], got {intrinsics.shape}")
+    x = (columns - intrinsics[0, 2]) / intrinsics[0, 0] * depth
+    y = (rows - intrinsics[1, 2]) / intrinsics[1, 1] * depth
+    return np.stack([x, y, depth], axis=-1).astype(np.float32)
+
+
+def sample_points(
+    points: np.ndarray,
+    num_points: int = 1024,
+    seed: int | None = None,
+    radius: float | None = None,
+    where: str = "points",
+) -> Cloud:
+    """Picks ``num_points`` of a raw cloud, in its own order.
+
+    Args:
+      points: [N, 3] metres, camera frame; rows with NaN or infinity are dropped and counted.
+      num_points: points to return; smaller clouds are repeated evenly.
+      seed: see ``systematic_indices``.
+      radius: see ``cloud_from_depth``.
+      where: the file or argument to name in errors.
+
+    Returns:
+      The cloud; ``index`` counts rows of ``points``.
+
+    Raises:
+      CaperError: wrong shape or dtype, millimetres, points behind the camera, or fewer than 16
+        usable points.
+    """
+    points = np.asarray(points)
+    if points.ndim != 2 or points.shape[-1] != 3:
+        raise CaperError(f"{where}: a cloud must be [N, 3], got {points.shape}")
+    if points.dtype.kind not in "fiu":
+        raise CaperError(f"{where}: a cloud must be numbers in metres, got {points.dtype}")
+    cast = points.astype(np.float32)
+    kept = np.flatnonzero(np.isfinite(cast).all(-1) & (cast != 0).any(-1))
+    _check_count(len(kept), f"of {len(points)} points in {where}")
+    median_depth = float(np.median(cast[kept, 2]))
+    if abs(median_depth) > _FARTHEST_M:
+        raise CaperError(
+            f"{where}: median depth {median_depth:.4g} m; these seem to be millimetres: "
+            "multiply by 0.001"
+        )
+    if median_depth <= 0:
+        raise CaperError(
+            f"{where}: median depth {median_depth:.4g} m lies behind the camera; the camera looks "
+            "along +z (OpenCV): from an OpenGL frame negate y and z"
+        )
+    if radius is not None:
+        kept = kept[_near(cast[kept], radius)]
+        _check_count(len(kept), f"of {len(points)} points in {where}")
+    index = kept[systematic_indices(len(kept), num_points, seed)]
+    return Cloud(cast[index], None, index, len(kept), len(points) - len(kept))
+
+
+def _near(points: np.ndarray, radius: float) -> np.ndarray:
+    """[N] bool: within ``radius`` of the median point, which a minority of outliers cannot move."""
+    if not radius > 0:
+        raise CaperError(f"radius must be positive metres, got {radius}")
+    return np.linalg.norm(points - np.median(points, axis=0), axis=-1) <= radius
+
+
+def _check_count(count: int, source: str) -> None:
+    if count < MIN_POINTS:
+        raise CaperError(
+            f"only {count} {source} are usable; at least {MIN_POINTS} points of the object are "
+            "needed"
+        )
+
+
+def _size(image: np.ndarray) -> str:
+    if image.ndim != 2:
+        return f"an array of shape {image.shape}"
+    return f"{image.shape[1]} x {image.shape[0]}"
+
+
+def read_points(path: str | Path) -> np.ndarray:
+    """Reads a raw cloud [N, 3] from ``.npy`` or ``.ply`` (ascii or binary), as stored.
+
+    Raises:
+      CaperError: missing, broken or truncated file, another format, or no x, y, z.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        return read_array(path)
+    if suffix != ".ply":
+        raise CaperError(f"{path}: a cloud must be .npy or .ply")
+    if not path.is_file():
+        raise CaperError(f"{path}: no such file")
+    return _parse_ply(path, path.read_bytes())
+
+
+_PLY_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def _parse_ply(path: Path, content: bytes) -> np.ndarray:
+    """[N, 3] float64 vertices; the vertex element must come first and hold no lists."""
+    header, separator, body = content.partition(b"end_header")
+    lines = header.decode("ascii", errors="replace").splitlines()
+    if not lines or lines[0].strip() != "ply" or not separator:
+        raise CaperError(f"{path}: not a PLY file (no 'ply' ... 'end_header')")
+    body = body[2:] if body.startswith(b"\r\n") else body[1:]
+    words = [line.split() for line in lines[1:] if line.split()]
+    orders = [word[1] for word in words if word[0] == "format" and len(word) > 1]
+    if len(orders) != 1 or orders[0] not in _PLY_ORDERS:
+        raise CaperError(f"{path}: PLY format must be one of {', '.join(_PLY_ORDERS)}")
+    elements = [i for i, word in enumerate(words) if word[0] == "element"]
+    if not elements or words[elements[0]][1:2] != ["vertex"]:
+        raise CaperError(f"{path}: the first PLY element must be 'vertex'")
+    last = elements[1] if len(elements) > 1 else len(words)
+    try:
+        count = int(words[elements[0]][2])
+        rows = [word for word in words[elements[0] : last] if word[0] == "property"]
+        fields = [(name, _PLY_ORDERS[orders[0]] + _PLY_TYPES[kind]) for _, kind, name in rows]
+    except (KeyError, ValueError, IndexError) as error:
+        raise CaperError(f"{path}: PLY vertices must be scalar properties ({error})") from error
+    names = [name for name, _ in fields]
+    if not {"x", "y", "z"} <= set(names):
+        raise CaperError(f"{path}: PLY vertices lack x, y, z (they have {', '.join(names)})")
+    try:
+        if orders[0] == "ascii":
+            values = np.array(body.split()[: count * len(fields)], np.float64)
+            table = dict(zip(names, values.reshape(count, len(fields)).T, strict=True))
+        else:
+            vertices = np.frombuffer(body, np.dtype(fields), count)
+            table = {name: vertices[name] for name in "xyz"}
+    except ValueError as error:
+        raise CaperError(f"{path}: broken or truncated PLY body ({error})") from error
+    return np.stack([np.asarray(table[name], np.float64) for name in "xyz"], axis=-1)

@@ -1,0 +1,249 @@
+"""Depth images, masks and camera intrinsics, read strictly and in metres."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from caper_jax.errors import CaperError
+
+_MILLIMETRE = 1e-3
+# No depth camera sees objects nearer than 2 cm, or resolves one beyond 50 m.
+_NEAREST_M, _FARTHEST_M = 0.02, 50.0
+
+
+def read_depth(path: str | Path, scale: float | None = None) -> np.ndarray:
+    """Reads a depth image.
+
+    Integer images (16-bit PNG, integer ``.npy``) hold millimetres, float images (``.npy``, TIFF)
+    metres. An 8-bit colour PNG holds the millimetres of ArtImage, ``256 * green + red`` (channels
+    1 and 2 in BGR order).
+
+    Args:
+      path: the image.
+      scale: metres per unit of the file, where the above does not hold.
+
+    Returns:
+      [H, W] float32 metres; 0, NaN and infinity mark pixels without a measurement.
+
+    Raises:
+      CaperError: missing or broken file, a kind of image that holds no depth, or values that
+        cannot be metres after scaling (the message says which unit they seem to be in).
+    """
+    raw = read_array(path)
+    if raw.ndim == 3 and raw.shape[-1] == 3 and raw.dtype == np.uint8:
+        raw = 256 * raw[..., 1].astype(np.uint16) + raw[..., 0]
+    elif raw.ndim != 2 or raw.dtype == np.uint8 or raw.dtype == bool:
+        raise CaperError(
+            f"{path}: {raw.dtype} image of shape {raw.shape} holds no depth; give a 16-bit "
+            "grayscale PNG in millimetres or a float .npy [H, W] in metres"
+        )
+    if scale is not None and not (np.isfinite(scale) and scale > 0):
+        raise CaperError(f"depth scale must be a positive number of metres per unit, got {scale}")
+    integer = np.issubdtype(raw.dtype, np.integer)
+    unit = scale if scale is not None else (_MILLIMETRE if integer else 1.0)
+    depth = raw.astype(np.float32) * np.float32(unit)
+    valid = np.isfinite(depth) & (depth > 0)
+    if valid.any():
+        _check_range(path, float(np.median(depth[valid])), integer, scale)
+    return depth
+
+
+def _check_range(path: str | Path, median: float, integer: bool, scale: float | None) -> None:
+    if _NEAREST_M <= median <= _FARTHEST_M:
+        return
+    if scale is not None:
+        advice = f"the depth scale {scale:g} does not fit this file"
+    elif integer and median < _NEAREST_M:
+        advice = (
+            "integers are read as millimetres, these seem to be whole metres or centimetres: "
+            "save 16-bit millimetres, or give the depth scale (metres per unit)"
+        )
+    elif integer:
+        advice = (
+            "integers are read as millimetres, these are finer or no depth at all: give the depth "
+            "scale (metres per unit, e.g. 0.0001)"
+        )
+    elif median > _FARTHEST_M:
+        advice = "floats are read as metres, these seem to be millimetres: give the scale 0.001"
+    else:
+        advice = "floats are read as metres, these are not: give the depth scale (metres per unit)"
+    raise CaperError(f"{path}: median depth would be {median:.3g} m; {advice}")
+
+
+def read_mask(path: str | Path) -> np.ndarray:
+    """Reads the mask of one object: everything that is not black.
+
+    Args:
+      path: grayscale, palette or colour image (transparent pixels are outside), or ``.npy``. In a
+        JPEG, whose black is not quite black, values above 127 count.
+
+    Returns:
+      [H, W] bool, true on the object.
+
+    Raises:
+      CaperError: missing or broken file, wrong shape, or no pixel in the mask.
+    """
+    raw = read_array(path)
+    if raw.ndim not in (2, 3) or (raw.ndim == 3 and raw.shape[-1] not in (2, 3, 4)):
+        raise CaperError(f"{path}: a mask must be an image, got an array of shape {raw.shape}")
+    threshold = 127 if Path(path).suffix.lower() in (".jpg", ".jpeg") else 0
+    if raw.ndim == 2:
+        mask = raw > threshold
+    elif raw.shape[-1] == 3:
+        mask = (raw > threshold).any(-1)
+    else:
+        mask = (raw[..., :-1] > threshold).any(-1) & (raw[..., -1] > 0)
+    if not mask.any():
+        raise CaperError(f"{path}: the mask is empty (all black); no object to estimate")
+    return mask
+
+
+def read_labels(path: str | Path) -> np.ndarray:
+    """Reads an image of labels: one integer per pixel, as stored.
+
+    Args:
+      path: grayscale, 16-bit or palette image (the index is the label), a colour image whose
+        first channel in BGR order holds the label (ArtImage), or an integer ``.npy``.
+
+    Returns:
+      [H, W] int32.
+
+    Raises:
+      CaperError: missing or broken file, or an image that is not made of integers.
+    """
+    raw = read_array(path)
+    if raw.ndim == 3 and raw.shape[-1] == 3:
+        raw = raw[..., 2]
+    if raw.ndim != 2 or not np.issubdtype(raw.dtype, np.integer):
+        raise CaperError(
+            f"{path}: a label image must be [H, W] integers, got {raw.dtype} {raw.shape}"
+        )
+    return raw.astype(np.int32)
+
+
+def read_array(path: str | Path) -> np.ndarray:
+    """Pixels of an image or ``.npy`` file as stored: [H, W] or [H, W, C].
+
+    Palette images give their indices, one-bit images booleans.
+
+    Raises:
+      CaperError: the file is missing, broken, or would need unpickling.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaperError(f"{path}: no such file")
+    try:
+        if path.suffix.lower() == ".npy":
+            return np.load(path, allow_pickle=False)
+        with Image.open(path) as image:
+            return np.asarray(image)
+    except UnidentifiedImageError as error:
+        raise CaperError(f"{path}: not an image (PNG, JPEG, TIFF or .npy expected)") from error
+    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
+        # Pillow reports a broken PNG chunk as SyntaxError.
+        raise CaperError(f"{path}: broken or truncated file ({error})") from error
+
+
+def read_json(path: str | Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+      CaperError: missing file, or broken JSON, with line and column.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaperError(f"{path}: no such file")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise CaperError(
+            f"{path}: broken JSON at line {error.lineno}, column {error.colno}: {error.msg}"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise CaperError(f"{path}: not a JSON text file ({error.reason})") from error
+
+
+def read_intrinsics(path: str | Path, image_shape: tuple[int, int] | None = None) -> np.ndarray:
+    """Reads the camera matrix of a pinhole camera.
+
+    Args:
+      path: JSON, one of: Open3D's ``{"width", "height", "intrinsic_matrix": 9 numbers, column by
+        column}``; ``{"fx", "fy", "cx", "cy"}``; ``{"K": 3x3 or 9 numbers, row by row}``, or the
+        same under ``"camera_matrix"``.
+      image_shape: (H, W) of the image it belongs to, checked against ``width`` and ``height``
+        where the file states them.
+
+    Returns:
+      [3, 3] float64 ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``, pixels.
+
+    Raises:
+      CaperError: missing or broken file, none of these layouts, a transposed matrix, focal lengths
+        that are not positive, or another image size.
+    """
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise CaperError(f"{path}: expected a JSON object with fx, fy, cx, cy or a matrix")
+    if "intrinsic_matrix" in content:
+        key, by_column = "intrinsic_matrix", True
+        matrix = _numbers(path, key, content[key]).reshape(3, 3).T
+    elif "fx" in content:
+        key, by_column = "fx, fy, cx, cy", False
+        missing = [name for name in ("fx", "fy", "cx", "cy") if name not in content]
+        if missing:
+            raise CaperError(f"{path}: has fx but lacks {', '.join(missing)}")
+        fx, fy, cx, cy = (_number(path, name, content[name]) for name in ("fx", "fy", "cx", "cy"))
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    else:
+        found = [name for name in ("K", "camera_matrix") if name in content]
+        if not found:
+            raise CaperError(
+                f"{path}: no camera matrix; expected the keys fx, fy, cx, cy, or "
+                f"intrinsic_matrix, K or camera_matrix, found {sorted(content)}"
+            )
+        key, by_column = found[0], False
+        matrix = _numbers(path, key, content[key]).reshape(3, 3)
+    _check_matrix(path, key, matrix, by_column)
+    if image_shape is not None and "width" in content and "height" in content:
+        height, width = image_shape
+        if (content["width"], content["height"]) != (width, height):
+            raise CaperError(
+                f"{path}: made for {content['width']} x {content['height']} images, this one is "
+                f"{width} x {height}; scale fx, fy, cx, cy, or give the right file"
+            )
+    return matrix
+
+
+def _check_matrix(path: str | Path, key: str, matrix: np.ndarray, by_column: bool) -> None:
+    if not np.array_equal(matrix[2], [0, 0, 1]):
+        if np.array_equal(matrix[:, 2], [0, 0, 1]):
+            order = "column by column" if by_column else "row by row"
+            raise CaperError(f"{path}: {key} is transposed; it must be given {order}")
+        raise CaperError(f"{path}: last row of {key} must be 0 0 1, got {matrix[2].tolist()}")
+    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+        raise CaperError(
+            f"{path}: focal lengths must be positive pixels, got {matrix[0, 0]:g} and "
+            f"{matrix[1, 1]:g}"
+        )
+    if matrix[1, 0] != 0 or abs(matrix[0, 1]) > 1e-6 * matrix[0, 0]:
+        raise CaperError(f"{path}: {key} has skew; rectify the images first")
+
+
+def _numbers(path: str | Path, key: str, value: Any) -> np.ndarray:
+    try:
+        numbers = np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise CaperError(f"{path}: {key} must be 9 numbers, got {value!r}") from error
+    if numbers.shape not in ((9,), (3, 3)) or not np.isfinite(numbers).all():
+        raise CaperError(f"{path}: {key} must be 9 finite numbers, got shape {numbers.shape}")
+    return numbers
+
+
+def _number(path: str | Path, key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise CaperError(f"{path}: {key} must be a number, got {value!r}")
+    return float(value)
