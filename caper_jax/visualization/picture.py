@@ -1,0 +1,292 @@
+"""One PNG that shows at a glance what was estimated: a row per scene. Needs no display."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import matplotlib
+import matplotlib.patheffects as effects
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.errors import CaperError
+from caper_jax.visualization.scene import (
+    BOX_EDGES,
+    Scene,
+    box_corners,
+    format_state,
+    hidden_edges,
+    joint_name,
+    joint_segments,
+    part_color,
+    project,
+)
+
+TITLES = ("Depth image and mask", "Estimate over the depth image", "Seen from another side")
+DPI = 110
+ROW_HEIGHT = 3.9  # inches
+WIDTHS = (3.4, 3.4, 3.4, 3.0)  # inches: three views and the legend
+INK, PAPER, TRUTH = "#1a1a1a", "#f4f4f2", "#333333"
+NEAREST = 1e-3  # metres; what is nearer to the camera's plane has no place in its image
+
+Projection = Callable[[np.ndarray], np.ndarray]
+
+
+def write_picture(path: str | Path, scenes: Sequence[Scene]) -> Path:
+    """Draws a row per scene: depth image, estimate over it, another side, sizes and states.
+
+    Boxes and points carry the colour of their part; edges behind the box are thin and dotted, the
+    truth thin and dashed, joint axes black arrows about which a positive state turns.
+
+    Args:
+      path: PNG to write; its folder is created.
+      scenes: at least one.
+
+    Returns:
+      The path written.
+
+    Raises:
+      CaperError: no scene, or a file that cannot be written.
+    """
+    if not scenes:
+        raise CaperError("a picture needs at least one scene")
+    figure = Figure(figsize=(sum(WIDTHS) + 0.9, ROW_HEIGHT * len(scenes) + 0.35), dpi=DPI)
+    FigureCanvasAgg(figure)
+    top = 1 - 0.45 / figure.get_figheight()
+    bottom = 0.35 / figure.get_figheight()
+    grid = figure.add_gridspec(
+        len(scenes), 4, width_ratios=WIDTHS, left=0.015, right=0.985, top=top, bottom=bottom
+    )
+    grid.update(wspace=0.05, hspace=0.16)
+    for row, scene in enumerate(scenes):
+        axes = [figure.add_subplot(grid[row, column]) for column in range(4)]
+        _draw_input(axes[0], scene)
+        _draw_estimate(axes[1], scene)
+        _draw_side(axes[2], scene)
+        _draw_legend(axes[3], scene)
+        if row == 0:
+            for axis, title in zip(axes, TITLES, strict=False):
+                axis.set_title(title, fontsize=12, color=INK, pad=8)
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=DPI, facecolor="white")
+    except OSError as error:
+        raise CaperError(f"cannot write {path}: {error.strerror or error}") from error
+    return path
+
+
+def _draw_input(axes: Axes, scene: Scene) -> None:
+    """The depth image around the object; without an image, the points by distance."""
+    _frame(axes)
+    near, far = _depth_range(scene)
+    colors = matplotlib.colormaps["viridis_r"].with_extremes(bad="#d9d9d9")
+    if scene.depth is None:
+        pixels = project(scene.points, _intrinsics(scene))
+        shown = axes.scatter(
+            *pixels.T, c=scene.points[:, 2], s=4, cmap=colors, vmin=near, vmax=far, linewidths=0
+        )
+        axes.set_facecolor(PAPER)
+    else:
+        image = np.where(np.nan_to_num(scene.depth) > 0, scene.depth, np.nan)
+        shown = axes.imshow(image, cmap=colors, vmin=near, vmax=far, interpolation="nearest")
+        if scene.mask is not None and scene.mask.any() and not scene.mask.all():
+            for width, color in ((2.6, "black"), (1.2, "white")):
+                axes.contour(scene.mask.astype(float), [0.5], colors=color, linewidths=width)
+    _crop(axes, scene)
+    bar = axes.inset_axes((0.0, -0.055, 1.0, 0.03))
+    axes.figure.colorbar(shown, cax=bar, orientation="horizontal", extend="both")
+    bar.tick_params(labelsize=8, length=2, pad=1)
+    bar.text(1.0, -3.2, "m", fontsize=8, ha="right", va="center", transform=bar.transAxes)
+
+
+def _draw_estimate(axes: Axes, scene: Scene) -> None:
+    """The estimate projected into the image."""
+    _frame(axes)
+    axes.set_facecolor(PAPER)
+    if scene.depth is not None:
+        near, far = _depth_range(scene)
+        image = np.where(np.nan_to_num(scene.depth) > 0, scene.depth, np.nan)
+        axes.imshow(image, cmap="gray_r", vmin=near, vmax=far, alpha=0.35, interpolation="nearest")
+    intrinsics = _intrinsics(scene)
+
+    def flat(points: np.ndarray) -> np.ndarray:
+        # What lies behind the camera is left out by giving it no place.
+        seen = np.where(points[..., 2:] > NEAREST, points, np.nan)
+        return project(seen, intrinsics)
+
+    _draw_objects(axes, scene, flat, eye=np.zeros(3), far_first=np.argsort(-scene.points[:, 2]))
+    _crop(axes, scene)
+
+
+def _draw_side(axes: Axes, scene: Scene) -> None:
+    """An orthographic view, turned about the object's up axis."""
+    _frame(axes)
+    axes.set_facecolor(PAPER)
+    right, down, forward = _side_view(scene)
+    plane = np.stack([right, down], axis=-1)
+    middle = box_corners(scene.pose).reshape(-1, 3).mean(0)
+
+    def flat(points: np.ndarray) -> np.ndarray:
+        return (points - middle) @ plane
+
+    far_first = np.argsort(-(scene.points @ forward))
+    _draw_objects(axes, scene, flat, eye=middle - 1e3 * forward, far_first=far_first)
+    shown = [flat(scene.points), flat(box_corners(scene.pose)).reshape(-1, 2)]
+    extent = np.concatenate(shown)
+    _square_limits(axes, extent.min(0), extent.max(0), margin=0.14)
+    _draw_scale(axes)
+
+
+def _draw_objects(
+    axes: Axes, scene: Scene, flat: Projection, eye: np.ndarray, far_first: np.ndarray
+) -> None:
+    """Points, boxes and joint axes through one projection."""
+    colors = np.array([part_color(part) for part in range(scene.category.num_parts)])
+    points = flat(scene.points)[far_first]
+    axes.scatter(*points.T, c=colors[scene.labels[far_first]], s=5, linewidths=0, alpha=0.55)
+    halo = [effects.withStroke(linewidth=3.4, foreground="white", alpha=0.8)]
+    if scene.truth is not None:
+        for corners in box_corners(scene.truth):
+            for a, b in BOX_EDGES:
+                line = flat(corners[[a, b]])
+                axes.plot(*line.T, color=TRUTH, linewidth=0.9, linestyle=(0, (5, 3)), zorder=3)
+    for part, corners in enumerate(box_corners(scene.pose)):
+        for (a, b), hidden in zip(BOX_EDGES, hidden_edges(corners, eye), strict=True):
+            style = (
+                {"linewidth": 1.0, "linestyle": (0, (1, 2)), "zorder": 4}
+                if hidden
+                else {"linewidth": 2.0, "path_effects": halo, "zorder": 5}
+            )
+            axes.plot(*flat(corners[[a, b]]).T, color=colors[part], **style)
+    for pose, dashed in ((scene.truth, True), (scene.pose, False)):
+        if pose is not None:
+            _draw_joints(axes, scene, pose, flat, dashed)
+
+
+def _draw_joints(
+    axes: Axes, scene: Scene, pose: ArticulatedPose, flat: Projection, dashed: bool
+) -> None:
+    for segment in joint_segments(pose, scene.category):
+        start, end = flat(segment)
+        if not np.isfinite([start, end]).all():
+            continue
+        if dashed:
+            axes.plot(*np.stack([start, end]).T, color=TRUTH, linewidth=1, linestyle=(0, (5, 3)))
+            continue
+        arrow = {
+            "arrowstyle": "-|>,head_length=0.6,head_width=0.25",
+            "color": "black",
+            "linewidth": 1.8,
+            "shrinkA": 0,
+            "shrinkB": 0,
+            "path_effects": [effects.withStroke(linewidth=3.6, foreground="white")],
+        }
+        axes.annotate("", xy=end, xytext=start, arrowprops=arrow, zorder=6)
+
+
+def _draw_legend(axes: Axes, scene: Scene) -> None:
+    """Names, sizes and states as text beside the colours and line styles they belong to."""
+    axes.set_axis_off()
+    axes.set_xlim(0, 1)
+    category, pose, truth = scene.category, scene.pose, scene.truth
+    rows: list[tuple[str, str, str]] = []  # (kind, colour or nothing, text)
+    for part, name in enumerate(category.parts):
+        size = " × ".join(f"{100 * extent:.1f}" for extent in np.asarray(pose.size)[part])
+        rows.append(("part", part_color(part), f"{name}   {size} cm"))
+    for index, joint in enumerate(category.joints):
+        state = format_state(float(pose.joint_state[index]), joint.type)
+        known = ""
+        if truth is not None:
+            known = f"   (truth {format_state(float(truth.joint_state[index]), joint.type)})"
+        rows.append(("joint", "black", f"{joint_name(category, index)}   {state}{known}"))
+    if truth is not None:
+        rows.append(("truth", TRUTH, "ground truth"))
+    pitch = min(0.095, 0.9 / (len(rows) + 1))
+    axes.set_ylim(1, 0)
+    axes.text(0.05, 0.045, scene.name, fontsize=12, fontweight="bold", color=INK, va="center")
+    for index, (kind, color, text) in enumerate(rows):
+        y = 0.05 + pitch * (index + 1.1)
+        if kind == "part":
+            axes.scatter([0.09], [y], s=90, c=color, marker="s", linewidths=0)
+        elif kind == "joint":
+            arrow = {"arrowstyle": "-|>", "color": color, "linewidth": 1.8}
+            axes.annotate("", xy=(0.135, y), xytext=(0.045, y), arrowprops=arrow)
+        else:
+            axes.plot([0.045, 0.135], [y, y], color=color, linewidth=1, linestyle=(0, (5, 3)))
+        axes.text(0.17, y, text, fontsize=10, color=INK, va="center", parse_math=False)
+
+
+def _draw_scale(axes: Axes) -> None:
+    """A bar of a round length, in the lower left corner of a view in metres."""
+    left, right = axes.get_xlim()
+    low, high = axes.get_ylim()
+    span = right - left
+    lengths = [digit * 10.0**power for power in range(-3, 3) for digit in (1, 2, 5)]
+    length = max((value for value in lengths if value < 0.3 * span), default=lengths[0])
+    x, y = left + 0.05 * span, low + 0.05 * (high - low)
+    axes.plot([x, x + length], [y, y], color=INK, linewidth=2.5, solid_capstyle="butt")
+    text = f"{100 * length:g} cm" if length < 1 else f"{length:g} m"
+    axes.text(x, y + 0.02 * (high - low), text, fontsize=9, color=INK)
+
+
+def _side_view(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit right, down and forward vectors of a viewer 65 degrees round the object, 25 above."""
+    root = np.asarray(scene.pose.rotation, float)[0]
+    up = root[:, "xyz".index(scene.category.viewpoint.up)]
+    toward = box_corners(scene.pose).reshape(-1, 3).mean(0)
+    level = toward - np.dot(toward, up) * up
+    if np.linalg.norm(level) < 0.1 * np.linalg.norm(toward):  # seen from straight above
+        level = -root[:, 2] + np.dot(root[:, 2], up) * up
+    level /= max(np.linalg.norm(level), 1e-9)
+    azimuth, elevation = np.radians(65), np.radians(25)
+    level = np.cos(azimuth) * level + np.sin(azimuth) * np.cross(up, level)
+    forward = np.cos(elevation) * level - np.sin(elevation) * up
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    return right, np.cross(forward, right), forward
+
+
+def _depth_range(scene: Scene) -> tuple[float, float]:
+    """Depths that the colours span: those of the object and half as much again on both sides."""
+    near, far = np.percentile(scene.points[:, 2], (1, 99))
+    reach = max(0.5 * (far - near), 0.01)
+    return float(near - reach), float(far + reach)
+
+
+def _intrinsics(scene: Scene) -> np.ndarray:
+    return np.eye(3) if scene.intrinsics is None else np.asarray(scene.intrinsics, float)
+
+
+def _crop(axes: Axes, scene: Scene) -> None:
+    """Limits the image to the object and the estimate, but not to a wildly wrong one."""
+    intrinsics = _intrinsics(scene)
+    pixels = project(scene.points, intrinsics)
+    low, high = pixels.min(0), pixels.max(0)
+    corners = box_corners(scene.pose).reshape(-1, 3)
+    corners = project(corners[corners[:, 2] > NEAREST], intrinsics)
+    most = (high - low).max()
+    if len(corners):
+        low = np.maximum(np.minimum(low, corners.min(0)), low - most)
+        high = np.minimum(np.maximum(high, corners.max(0)), high + most)
+    _square_limits(axes, low, high, margin=0.12)
+
+
+def _square_limits(axes: Axes, low: np.ndarray, high: np.ndarray, margin: float) -> None:
+    """Equal limits in x and y, y downwards, the box (low, high) in the middle."""
+    middle = (low + high) / 2
+    half = max(float((high - low).max()) * (0.5 + margin), 1e-6)
+    axes.set_xlim(middle[0] - half, middle[0] + half)
+    axes.set_ylim(middle[1] + half, middle[1] - half)
+    axes.set_aspect("equal")
+
+
+def _frame(axes: Axes) -> None:
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_color("#bbbbbb")

@@ -1,0 +1,178 @@
+"""One frame with its estimate, and the lines that pictures draw of it. All in NumPy.
+
+Everything is in the camera's frame (OpenCV: x right, y down, z forward), metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from caper_jax.articulation.category import Category
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.data.schema import pose_shapes
+from caper_jax.errors import CaperError
+
+# Okabe and Ito's colours, which colour-blind people can tell apart; yellow, hard to see on white,
+# comes last.
+PART_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442")
+
+# Corners as sign patterns (x slowest, z fastest); an edge joins corners that differ in one sign.
+CORNER_SIGNS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+BOX_EDGES = tuple(
+    (a, b)
+    for a in range(8)
+    for b in range(a + 1, 8)
+    if np.sum(CORNER_SIGNS[a] != CORNER_SIGNS[b]) == 1
+)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What one picture shows.
+
+    Attributes:
+      name: title of the frame.
+      category: names of the parts, joint types and tree.
+      points: [N, 3] object points.
+      labels: [N] predicted part of every point, 0 to K - 1.
+      pose: the estimate, arrays without batch axes ([K, ...] and [J, ...]).
+      truth: ground truth of the same form, if known.
+      depth: [H, W] metres, 0 where there is none, if known.
+      mask: [H, W] bool, the object in ``depth``, if known.
+      intrinsics: [3, 3] of ``depth``; needed with it.
+
+    Raises:
+      CaperError: shapes that do not fit together, or numbers that are not finite.
+    """
+
+    name: str
+    category: Category
+    points: np.ndarray
+    labels: np.ndarray
+    pose: ArticulatedPose
+    truth: ArticulatedPose | None = None
+    depth: np.ndarray | None = None
+    mask: np.ndarray | None = None
+    intrinsics: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        problems = []
+        points = np.asarray(self.points, float)
+        labels = np.asarray(self.labels)
+        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+            problems.append(f"points must be finite numbers [N, 3], got shape {points.shape}")
+        if labels.shape != points.shape[:1]:
+            problems.append(f"labels has shape {labels.shape}, points {points.shape}")
+        elif labels.size and not 0 <= labels.min() <= labels.max() < self.category.num_parts:
+            problems.append(f"labels must be 0 to {self.category.num_parts - 1}")
+        for which, pose in (("pose", self.pose), ("truth", self.truth)):
+            for key, shape in pose_shapes(self.category.num_parts).items() if pose else ():
+                array = np.asarray(getattr(pose, key))
+                if array.shape != shape or not np.isfinite(array).all():
+                    problems.append(f"{which}.{key} must be finite {shape}, got {array.shape}")
+        if self.depth is not None:
+            if np.ndim(self.depth) != 2:
+                problems.append(f"depth must be [H, W], got {np.shape(self.depth)}")
+            if np.shape(self.intrinsics) != (3, 3):
+                problems.append("depth needs intrinsics [3, 3]")
+            if self.mask is not None and np.shape(self.mask) != np.shape(self.depth):
+                problems.append(f"mask is {np.shape(self.mask)}, depth {np.shape(self.depth)}")
+        if problems:
+            raise CaperError(f"scene {self.name!r}: {'; '.join(problems)}")
+
+    @property
+    def poses(self) -> tuple[tuple[str, ArticulatedPose], ...]:
+        """The estimate and, where known, the truth, by name."""
+        estimate = (("estimate", self.pose),)
+        return (*estimate, ("truth", self.truth)) if self.truth is not None else estimate
+
+
+def part_color(part: int) -> str:
+    """Hex colour of a part; the colours repeat after the last."""
+    return PART_COLORS[part % len(PART_COLORS)]
+
+
+def box_corners(pose: ArticulatedPose) -> np.ndarray:
+    """[K, 8, 3] corners of all parts' boxes in the camera's frame, in ``CORNER_SIGNS`` order."""
+    size, center = np.asarray(pose.size, float), np.asarray(pose.box_center, float)
+    rest = center[:, None] + CORNER_SIGNS * size[:, None] / 2
+    rotation, translation = np.asarray(pose.rotation, float), np.asarray(pose.translation, float)
+    return np.einsum("kij,knj->kni", rotation, rest) + translation[:, None]
+
+
+def joint_lines(pose: ArticulatedPose, category: Category) -> tuple[np.ndarray, np.ndarray]:
+    """The joints' axes in the camera's frame.
+
+    Axes and pivots are given in the root's rest frame; at rest all parts share that frame, so the
+    pose of the part that a joint is mounted on carries them to the camera, however deep the tree.
+
+    Returns:
+      ([J, 3] unit directions, [J, 3] points on the axes, metres).
+    """
+    parents = list(category.parents)
+    rotation = np.asarray(pose.rotation, float)[parents]
+    axis = np.einsum("jab,jb->ja", rotation, np.asarray(pose.joint_axis, float))
+    pivot = np.einsum("jab,jb->ja", rotation, np.asarray(pose.joint_pivot, float))
+    return axis, pivot + np.asarray(pose.translation, float)[parents]
+
+
+def joint_segments(pose: ArticulatedPose, category: Category) -> np.ndarray:
+    """The piece of every joint's axis to draw, a little longer than the part that it carries.
+
+    A revolute joint's piece lies on its axis, beside the part. A prismatic joint has a direction
+    but no place, so its piece goes through the middle of the part.
+
+    Returns:
+      [J, 2, 3] start and end; the axis points from start to end.
+    """
+    axis, point = joint_lines(pose, category)
+    corners = box_corners(pose)[1:]
+    middle = corners.mean(1)
+    along = np.einsum("jni,ji->jn", corners - middle[:, None], axis)
+    reach = along.max(1) + 0.12 * np.linalg.norm(np.ptp(corners, axis=1), axis=-1)
+    on_axis = point + np.sum((middle - point) * axis, -1, keepdims=True) * axis
+    turning = np.array([joint.type == "revolute" for joint in category.joints])
+    middle = np.where(turning[:, None], on_axis, middle)
+    offset = reach[:, None] * axis
+    return np.stack([middle - offset, middle + offset], axis=1)
+
+
+def hidden_edges(corners: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """Which edges of one box its own faces hide.
+
+    Args:
+      corners: [8, 3] in ``CORNER_SIGNS`` order.
+      eye: [3] position of the viewer, same frame; far away for an orthographic view.
+
+    Returns:
+      [12] bool in ``BOX_EDGES`` order: both faces at the edge look away from the viewer.
+    """
+    middle = corners.mean(0)
+    away = {}
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            face = corners[CORNER_SIGNS[:, axis] == sign].mean(0)
+            away[axis, sign] = np.dot(face - middle, face - eye) >= 0
+    hidden = []
+    for a, b in BOX_EDGES:
+        shared = np.flatnonzero(CORNER_SIGNS[a] == CORNER_SIGNS[b])
+        hidden.append(all(away[axis, CORNER_SIGNS[a, axis]] for axis in shared))
+    return np.array(hidden)
+
+
+def project(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Pixels [..., 2] of camera points [..., 3] in front of the camera; pixel centres are whole."""
+    image = np.asarray(points, float) @ np.asarray(intrinsics, float).T
+    return image[..., :2] / image[..., 2:]
+
+
+def format_state(state: float, joint_type: str) -> str:
+    """A joint state for people: ``87.3°`` or ``12.4 cm``."""
+    return f"{np.degrees(state):.1f}°" if joint_type == "revolute" else f"{100 * state:.1f} cm"
+
+
+def joint_name(category: Category, joint: int) -> str:
+    """``base – lid``: the part that a joint is mounted on and the one it carries."""
+    return f"{category.parts[category.parents[joint]]} – {category.parts[joint + 1]}"
