@@ -1,0 +1,1 @@
+"""Training: optimiser, state, loop, checkpoints, parallelism and export of models."""

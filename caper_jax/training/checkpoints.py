@@ -1,0 +1,264 @@
+"""Checkpoints of a training run: Orbax, with the checks that Orbax leaves to the caller.
+
+Orbax commits a step atomically, but it never falls back from a damaged step, casts a changed
+dtype in silence and does not notice a flipped bit. `Checkpoints.restore` walks back to the newest
+step that reads back exactly as it was written, and says what it passed over.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import sys
+import warnings
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from caper_jax.errors import CaperError
+
+PyTree = Any
+
+_UNREADABLE = ".unreadable"
+
+
+class CheckpointWarning(UserWarning):
+    """A checkpoint could not be read and an older one was used."""
+
+
+class Checkpoints:
+    """The numbered checkpoints in one directory; use as a context manager.
+
+    Args:
+      directory: created if absent.
+      keep: newest checkpoints to keep.
+    """
+
+    def __init__(self, directory: str | Path, keep: int = 3) -> None:
+        self.directory = Path(directory).absolute()
+        self._keep = keep
+        self._unreadable: list[int] = []
+        self._manager = self._open()
+
+    def __enter__(self) -> Checkpoints:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _open(self) -> ocp.CheckpointManager:
+        options = ocp.CheckpointManagerOptions(max_to_keep=self._keep, create=True)
+        with _quiet():
+            return ocp.CheckpointManager(
+                self.directory,
+                options=options,
+                item_handlers={  # named, so that metadata can be read before any save
+                    "state": ocp.StandardCheckpointHandler(),
+                    "note": ocp.JsonCheckpointHandler(),
+                },
+            )
+
+    def steps(self) -> list[int]:
+        """Steps on disk, oldest first, whether they can be read or not."""
+        with _quiet():
+            return sorted(self._manager.all_steps(read=True))
+
+    def save(self, step: int, state: PyTree, extra: dict[str, Any] | None = None) -> None:
+        """Write a checkpoint in the background; the arrays may be donated once this returns.
+
+        Args:
+          step: its number; must not exist yet.
+          state: pytree of arrays, the same on every process.
+          extra: what JSON can hold.
+
+        Raises:
+          CaperError: it was not written (a failure of an earlier background write included).
+        """
+        self._move_unreadable_aside()
+        note = {"extra": extra or {}, "checksums": _checksums(state)}
+        arguments = ocp.args.Composite(
+            state=ocp.args.StandardSave(state), note=ocp.args.JsonSave(note)
+        )
+        try:
+            with _quiet():
+                saved = self._manager.save(step, args=arguments, force=True)
+        except Exception as error:
+            raise CaperError(f"{self.directory}: cannot save step {step}: {error}") from error
+        if not saved:
+            raise CaperError(f"{self.directory}: step {step} was not saved")
+
+    def restore(self, template: PyTree) -> tuple[PyTree, dict[str, Any]] | None:
+        """Read the newest intact checkpoint.
+
+        Steps that cannot be read are named in a `CheckpointWarning`; they are left in place, and
+        renamed to ``<step>.unreadable`` when the run writes its next checkpoint.
+
+        Args:
+          template: pytree of arrays or ``jax.ShapeDtypeStruct``; the result takes its structure,
+            and its shardings where it has them, whatever devices the checkpoint was saved from.
+
+        Returns:
+          (state, extra), or None if there is no checkpoint.
+
+        Raises:
+          CaperError: a leaf is missing, unexpected or of another shape or dtype than the
+            template's, or checkpoints exist and none can be read.
+        """
+        abstract = jax.tree.map(_abstract, template)
+        steps = self.steps()
+        self._unreadable, failures = [], []
+        for step in reversed(steps):
+            where = self.directory / str(step)
+            try:
+                with _quiet():
+                    restored = self._read(step, abstract)
+            except CaperError:
+                raise
+            except Exception as error:  # Orbax and TensorStore raise whatever they please
+                failures.append(f"{where} ({_brief(error)})")
+                self._unreadable.append(step)
+                _drop_failed_reads()
+                continue
+            for failure in failures:
+                warnings.warn(
+                    f"cannot read the checkpoint {failure}; falling back to step {step}",
+                    CheckpointWarning,
+                    stacklevel=2,
+                )
+            return restored
+        if failures:
+            raise CaperError(
+                f"no checkpoint can be read: {'; '.join(failures)}; "
+                f"move {self.directory} away to start anew"
+            )
+        return None
+
+    def _read(self, step: int, abstract: PyTree) -> tuple[PyTree, dict[str, Any]]:
+        metadata = self._manager.item_metadata(step).get("state")
+        if metadata is None:
+            raise ValueError("it was never completed")
+        _compare(_leaves(metadata.tree), _leaves(abstract), str(self.directory / str(step)))
+        arguments = ocp.args.Composite(
+            state=ocp.args.StandardRestore(abstract), note=ocp.args.JsonRestore()
+        )
+        restored = self._manager.restore(step, args=arguments)
+        state, note = restored["state"], restored["note"]
+        found = _checksums(state)
+        damaged = [name for name, value in note["checksums"].items() if found.get(name) != value]
+        if damaged:
+            raise ValueError(f"checksum of {damaged[0]} differs")
+        return state, note["extra"]
+
+    def _move_unreadable_aside(self) -> None:
+        """Free the numbers of damaged steps, and keep retention from counting them."""
+        if not self._unreadable:
+            return
+        self._manager.close()
+        if jax.process_index() == 0:
+            for step in self._unreadable:
+                source = self.directory / str(step)
+                target = source.with_name(source.name + _UNREADABLE)
+                number = 1
+                while target.exists():
+                    number += 1
+                    target = source.with_name(f"{source.name}{_UNREADABLE}{number}")
+                source.rename(target)
+        if jax.process_count() > 1:
+            from jax.experimental import multihost_utils
+
+            multihost_utils.sync_global_devices("caper_jax.checkpoints.move_aside")
+        self._unreadable = []
+        self._manager = self._open()
+
+    def wait(self) -> None:
+        """Block until the background write is on disk; CaperError if it failed."""
+        try:
+            with _quiet():
+                self._manager.wait_until_finished()
+                self._manager.check_for_errors()
+        except Exception as error:
+            raise CaperError(f"{self.directory}: the last save failed: {error}") from error
+
+    def close(self) -> None:
+        """Wait for the background write, then release the directory."""
+        try:
+            self.wait()
+        finally:
+            with _quiet():
+                self._manager.close()
+
+
+def _abstract(leaf: Any) -> jax.ShapeDtypeStruct:
+    sharding = getattr(leaf, "sharding", None)
+    if sharding is None:
+        sharding = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+
+
+def _leaves(tree: PyTree) -> dict[str, Any]:
+    """Leaves by "a/b/c" path; the same for a state and for Orbax's nested dicts of it."""
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): leaf
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
+    }
+
+
+def _compare(saved: dict[str, Any], wanted: dict[str, Any], where: str) -> None:
+    """Raise a CaperError naming the first leaf on which checkpoint and template disagree."""
+    for name in sorted(saved.keys() | wanted.keys()):
+        if name not in saved:
+            raise CaperError(f"checkpoint {where} has no {name!r}; it is of another model")
+        if name not in wanted:
+            raise CaperError(f"checkpoint {where} has {name!r}, which this model has not")
+        for field, have, want in (
+            ("shape", tuple(saved[name].shape), tuple(wanted[name].shape)),
+            ("dtype", np.dtype(saved[name].dtype).name, np.dtype(wanted[name].dtype).name),
+        ):
+            if have != want:
+                raise CaperError(
+                    f"checkpoint {where}: {name!r} has {field} {have}, this model needs {want}"
+                )
+
+
+def _checksums(tree: PyTree) -> dict[str, int]:
+    """CRC-32 of every leaf, by path."""
+    return {
+        name: zlib.crc32(np.ascontiguousarray(jax.device_get(leaf)).tobytes())
+        for name, leaf in _leaves(tree).items()
+    }
+
+
+def _brief(error: Exception) -> str:
+    """The first sentence of an error; TensorStore appends pages of its configuration."""
+    lines = str(error).strip().splitlines()
+    return lines[0].partition(". See full")[0][:200] if lines else type(error).__name__
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Orbax's log lines about every save and every odd directory off standard error."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def _drop_failed_reads() -> None:
+    """Collect the coroutines of a failed read, whose errors were reported once already."""
+    hook: Callable[[Any], Any] = sys.unraisablehook
+    sys.unraisablehook = lambda _: None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            gc.collect()
+    finally:
+        sys.unraisablehook = hook

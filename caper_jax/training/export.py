@@ -1,0 +1,149 @@
+"""Model directories: float16 weights and a card, written by training and read by the estimator."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from caper_jax.errors import CaperError
+
+PyTree = Any
+WEIGHTS_FILE = "weights.npz"
+CARD_FILE = "model.json"
+
+_HALF_TOLERANCE = 1e-3  # relative; float16 itself keeps 5e-4 where it is not subnormal
+
+
+def write_model(directory: str | Path, variables: PyTree, card: dict[str, Any]) -> None:
+    """Write ``weights.npz`` and ``model.json``; each file appears complete or not at all.
+
+    Leaves are stored as float16, or as float32 where the round trip through float16 loses more
+    than 1e-3 relative (overflow, or values near zero such as the variances of batch norm): of any
+    value of a vector, of the norm of a kernel.
+
+    Args:
+      directory: created if absent; a model in it is replaced.
+      variables: nested dicts of float arrays, e.g. ``TrainState.variables``.
+      card: what JSON can hold, without NaN.
+
+    Raises:
+      CaperError: a weight is not finite or not a float, or the card is not JSON.
+    """
+    directory = Path(directory)
+    arrays = {name: _compact(name, leaf) for name, leaf in flatten(variables).items()}
+    try:
+        text = json.dumps(card, indent=2, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise CaperError(f"the model card cannot be written as JSON: {error}") from error
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    directory.mkdir(parents=True, exist_ok=True)
+    write_atomically(directory / WEIGHTS_FILE, buffer.getvalue())
+    write_atomically(directory / CARD_FILE, text.encode() + b"\n")
+
+
+def read_model(directory: str | Path) -> tuple[dict[str, Any], PyTree]:
+    """Read a model directory.
+
+    Args:
+      directory: holds ``weights.npz`` and ``model.json``.
+
+    Returns:
+      (card, variables): the card as written, and nested dicts of float32 numpy arrays.
+
+    Raises:
+      CaperError: a file is missing, damaged, or holds a weight that is not a finite float.
+    """
+    directory = Path(directory)
+    for name in (CARD_FILE, WEIGHTS_FILE):
+        if not (directory / name).is_file():
+            raise CaperError(f"{directory} is not a model directory: it has no {name}")
+    path = directory / CARD_FILE
+    try:
+        card = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise CaperError(f"{path} is not valid JSON: {error}") from error
+    if not isinstance(card, dict):
+        raise CaperError(f"{path} must hold a JSON object, got {type(card).__name__}")
+
+    path = directory / WEIGHTS_FILE
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise CaperError(f"{path} is damaged or not a weights file: {error}") from error
+    for name, array in arrays.items():
+        if array.dtype not in (np.float16, np.float32):
+            raise CaperError(f"{path}: {name!r} is {array.dtype}, expected float16 or float32")
+        if not np.isfinite(array).all():
+            raise CaperError(f"{path}: {name!r} has values that are not finite")
+    return card, unflatten({name: a.astype(np.float32) for name, a in arrays.items()}, str(path))
+
+
+def flatten(variables: PyTree) -> dict[str, Any]:
+    """Leaves of nested dicts by "a/b/c" path."""
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): leaf
+        for path, leaf in jax.tree_util.tree_flatten_with_path(variables)[0]
+    }
+
+
+def unflatten(flat: dict[str, Any], where: str = "variables") -> PyTree:
+    """Nested dicts from leaves by path.
+
+    Args:
+      flat: leaves by "a/b/c" path.
+      where: for the error message.
+
+    Raises:
+      CaperError: a name is both a leaf and the parent of one.
+    """
+    tree: dict[str, Any] = {}
+    for name, leaf in flat.items():
+        *parents, last = name.split("/")
+        node = tree
+        for parent in parents:
+            node = node.setdefault(parent, {})
+            if not isinstance(node, dict):
+                raise CaperError(f"{where}: {name!r} lies below another array")
+        if last in node:
+            raise CaperError(f"{where}: {name!r} is both an array and a group")
+        node[last] = leaf
+    return tree
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that a kill at any moment leaves the old one or the new one."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _compact(name: str, leaf: Any) -> np.ndarray:
+    """A leaf as float16 if that loses little, else as float32."""
+    array = np.asarray(jax.device_get(leaf))
+    if not np.issubdtype(array.dtype, np.floating) and array.dtype != jax.numpy.bfloat16:
+        raise CaperError(f"weight {name!r} is {array.dtype}; only floats can be exported")
+    array = array.astype(np.float32)
+    if not np.isfinite(array).all():
+        raise CaperError(f"weight {name!r} has values that are not finite")
+    with np.errstate(over="ignore"):
+        half = array.astype(np.float16)
+    error, scale = np.abs(half.astype(np.float32) - array), np.abs(array)
+    if array.ndim > 1:  # a kernel may lose its tiniest entries, a variance or a bias may not
+        error, scale = np.linalg.norm(error), np.linalg.norm(scale)
+    return half if np.all(error <= _HALF_TOLERANCE * scale) else array

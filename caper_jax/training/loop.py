@@ -1,0 +1,421 @@
+"""The training loop: budget, metrics, checkpoints, clean stops and exact resumes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from caper_jax.errors import CaperError
+from caper_jax.progress import progress as progress_display
+from caper_jax.training import parallel
+from caper_jax.training.checkpoints import Checkpoints
+from caper_jax.training.export import write_atomically
+from caper_jax.training.metrics_log import MetricsLog
+from caper_jax.training.optimizer import Optimizer, OptimizerName, flat_and_anneal
+from caper_jax.training.state import LossFn, TrainState, make_step
+
+PyTree = Any
+
+# Keys of the configuration that a resumed run may change: they do not touch the result.
+_FREE_KEYS = frozenset(
+    {"training.checkpoint_minutes", "training.checkpoint_steps", "training.keep_checkpoints"}
+)
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How to train; a run is bounded by ``steps`` or by ``minutes``, exactly one of them.
+
+    Attributes:
+      batch_size: samples per step over all devices.
+      learning_rate: base rate; see `flat_and_anneal` for its course.
+      optimizer: "ranger" or "adamw".
+      warmup: steps of linear warm-up.
+      clip_norm: bound on the global norm of the gradient.
+      weight_decay: decoupled weight decay.
+      steps: length of the run in steps; the result is then a function of the seed.
+      minutes: length of the run in minutes of training, summed over resumes.
+      seed: every random number of the run follows from it.
+      steps_per_dispatch: steps compiled into one call, to hide the cost of calling.
+      log_steps: steps averaged into one line of metrics.jsonl.
+      checkpoint_minutes: time between checkpoints.
+      checkpoint_steps: steps between checkpoints, besides those by time; 0 for none.
+      keep_checkpoints: newest checkpoints to keep.
+      max_bad_steps: stop after so many steps without a finite gradient in a row.
+    """
+
+    batch_size: int = 16
+    learning_rate: float = 1e-4
+    optimizer: OptimizerName = "ranger"
+    warmup: int = 1000
+    clip_norm: float = 5.0
+    weight_decay: float = 0.0
+    steps: int | None = None
+    minutes: float | None = None
+    seed: int = 0
+    steps_per_dispatch: int = 1
+    log_steps: int = 50
+    checkpoint_minutes: float = 5.0
+    checkpoint_steps: int = 0
+    keep_checkpoints: int = 3
+    max_bad_steps: int = 50
+
+    def __post_init__(self) -> None:
+        if (self.steps is None) == (self.minutes is None):
+            raise CaperError(
+                f"training needs either steps or minutes, got steps={self.steps}, "
+                f"minutes={self.minutes}"
+            )
+        least = {
+            "batch_size": 1,
+            "steps_per_dispatch": 1,
+            "log_steps": 1,
+            "keep_checkpoints": 1,
+            "max_bad_steps": 1,
+            "warmup": 0,
+            "checkpoint_steps": 0,
+        }
+        for name, bound in least.items():
+            if getattr(self, name) < bound:
+                raise CaperError(f"training.{name} must be {bound} or more")
+        for name in ("steps", "minutes", "checkpoint_minutes"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise CaperError(f"training.{name} must be positive, got {value}")
+        if not 0 <= self.seed < 2**32:
+            raise CaperError(f"training.seed must be in 0..2**32 - 1, got {self.seed}")
+
+    def build_optimizer(self) -> Optimizer:
+        """The optimiser these settings describe."""
+        return Optimizer(self.optimizer, self.learning_rate, self.clip_norm, self.weight_decay)
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What `fit` hands back.
+
+    Attributes:
+      state: the last training state; ``state.variables`` are the weights to use.
+      finished: whether the budget was used up; False after SIGTERM or Ctrl-C.
+    """
+
+    state: TrainState
+    finished: bool
+
+
+def fit(
+    directory: str | Path,
+    config: TrainingConfig,
+    loss_fn: LossFn,
+    variables: dict[str, PyTree],
+    *,
+    batch_fn: Callable[..., PyTree] | None = None,
+    data: PyTree = None,
+    batches: Callable[[int], PyTree] | None = None,
+    mesh: jax.sharding.Mesh | None = None,
+    description: dict[str, Any] | None = None,
+) -> FitResult:
+    """Train; call again with the same arguments to go on where a run stopped or was killed.
+
+    The run directory holds config.json, metrics.jsonl and checkpoints/. A run bounded by steps
+    ends with the same bits however often it was interrupted, on the same machine and software
+    (on GPUs only as far as the operations of the loss are deterministic).
+
+    Args:
+      directory: the run directory.
+      config: how to train.
+      loss_fn: see `make_step`.
+      variables: initial variables of the network; on resume their shapes and dtypes.
+      batch_fn: ``(key) -> batch`` or ``(key, data) -> batch``, traced into the step.
+      data: arrays handed to ``batch_fn`` besides the key, kept on the device.
+      batches: instead of ``batch_fn``: ``(step) -> batch`` on the host, global and the same on
+        every process; a function of the step, so that a resumed run sees the same data.
+      mesh: devices to split the batch over; one device without it.
+      description: what else defines the run (network, data); kept in config.json and compared
+        on resume. Must be JSON-serialisable.
+
+    Raises:
+      CaperError: the directory holds a run of another configuration or cannot be read, a
+        configuration value is out of range, or the loss stays non-finite.
+    """
+    if (batch_fn is None) == (batches is None):
+        raise ValueError("give either batch_fn or batches")
+    if batches is not None and config.steps_per_dispatch != 1:
+        raise CaperError("training.steps_per_dispatch must be 1 with batches from the host")
+    if mesh is None and jax.process_count() > 1:
+        mesh = parallel.data_mesh()
+    parallel.check_batch_size(config.batch_size, mesh)
+    directory = Path(directory)
+    check_configuration(directory, {"training": dataclasses.asdict(config), **(description or {})})
+
+    optimizer = config.build_optimizer()
+    step_fn = make_step(loss_fn, optimizer, batch_fn=batch_fn, mesh=mesh)
+    sharding = parallel.replicated(mesh) if mesh is not None else parallel.one_device()
+    state = parallel.place(TrainState.create(variables, optimizer, config.seed), sharding)
+    if data is not None:
+        data = parallel.place(data, sharding)
+
+    def batch_of(step: int) -> PyTree:
+        if batches is None:
+            return data
+        batch = batches(step)
+        return batch if mesh is None else parallel.place(batch, parallel.batch_sharding(mesh))
+
+    with (
+        Checkpoints(directory / "checkpoints", keep=config.keep_checkpoints) as checkpoints,
+        _StopRequest() as stop,
+    ):
+        state, extra = checkpoints.restore(state) or (state, {})
+        return _Run(config, directory, checkpoints, stop, state, extra).go(step_fn, batch_of)
+
+
+class _Run:
+    """The moving parts of one call of `fit`."""
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        directory: Path,
+        checkpoints: Checkpoints,
+        stop: _StopRequest,
+        state: TrainState,
+        extra: dict[str, Any],
+    ) -> None:
+        self.config = config
+        self.directory = directory
+        self.checkpoints = checkpoints
+        self.stop = stop
+        self.state = state
+        self.step = int(state.step)
+        self.saved_step = self.step if extra else -1
+        self.elapsed_before = float(state.elapsed)
+        self.began = self.saved_at = time.monotonic()
+        self.metrics = MetricsLog(
+            directory / "metrics.jsonl" if jax.process_index() == 0 else None,
+            self.step,
+            config.log_steps,
+            config.batch_size,
+            extra.get("metrics"),
+        )
+        # The dispatch whose metrics were not read yet: (its last step, factors, metrics).
+        self.unread: tuple[int, np.ndarray, dict[str, jax.Array]] | None = None
+        self.factor = 0.0
+        self.first_read = True
+
+    def go(
+        self,
+        step_fn: Callable[..., tuple[TrainState, dict[str, jax.Array]]],
+        batch_of: Callable[[int], PyTree],
+    ) -> FitResult:
+        """Train until the budget is used up or a stop is requested; saves at the end."""
+        with self.display() as show:
+            while True:
+                elapsed, stop, due = parallel.agree(
+                    [self.elapsed(), self.stop.requested, self.save_due()]
+                )
+                finished = self.fraction(self.step, elapsed) >= 1.0
+                if stop or finished:
+                    break
+                if due:
+                    self.save()
+                progress, factor = self.schedule(elapsed)
+                self.state, metrics = step_fn(self.state, progress, factor, batch_of(self.step))
+                self.step += len(factor)
+                # One dispatch stays unread, so that the device need not wait for the host.
+                self.read()
+                self.unread = self.step, factor, metrics
+                show()
+            self.read()
+            if finished:
+                self.metrics.flush(self.step, self.factor, self.elapsed())
+            self.save()
+            show()
+        if not finished:
+            print(
+                f"stopped at step {self.step}; the same command resumes from {self.directory}",
+                file=sys.stderr,
+            )
+        return FitResult(self.state, finished)
+
+    def elapsed(self) -> float:
+        """Seconds of training, in this call and those before it."""
+        return self.elapsed_before + time.monotonic() - self.began
+
+    def fraction(self, step: int, elapsed: float) -> float:
+        """How much of the budget is used."""
+        if self.config.steps is not None:
+            return step / self.config.steps
+        assert self.config.minutes is not None
+        return elapsed / (60.0 * self.config.minutes)
+
+    def schedule(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
+        """(progress, factor) [n] float32 of the next dispatch of n steps."""
+        count = self.config.steps_per_dispatch
+        if self.config.steps is not None:
+            count = min(count, self.config.steps - self.step)
+        steps = range(self.step, self.step + count)
+        progress = [self.fraction(step, elapsed) for step in steps]
+        factor = [
+            flat_and_anneal(p, step, self.config.warmup)
+            for p, step in zip(progress, steps, strict=True)
+        ]
+        return np.asarray(progress, np.float32), np.asarray(factor, np.float32)
+
+    def read(self) -> None:
+        """Log the dispatch that is still unread; waits for it."""
+        if self.unread is None:
+            return
+        last, factors, on_device = self.unread
+        self.unread = None
+        metrics = {name: values.tolist() for name, values in jax.device_get(on_device).items()}
+        for index, factor in enumerate(factors.tolist()):
+            step = last - len(factors) + index + 1
+            row = {name: values[index] for name, values in metrics.items()}
+            self.metrics.add(step, row, factor, self.elapsed())
+            if self.metrics.bad_in_a_row >= self.config.max_bad_steps:
+                raise CaperError(
+                    f"training diverged: the loss or its gradient was not finite in the "
+                    f"{self.metrics.bad_in_a_row} steps up to step {step} (loss {row['loss']}); "
+                    "lower the learning rate, or look for bad samples"
+                )
+            self.factor = factor
+        if self.first_read:  # that dispatch compiled: its time says nothing of the rate
+            self.first_read = False
+            self.metrics.restart_clock()
+
+    def save_due(self) -> bool:
+        """Whether a checkpoint is due, by the clock or by the step."""
+        if time.monotonic() - self.saved_at >= 60.0 * self.config.checkpoint_minutes:
+            return True
+        every = self.config.checkpoint_steps
+        return every > 0 and self.step // every > max(self.saved_step, 0) // every
+
+    def save(self) -> None:
+        """Write a checkpoint of the current step, unless it was written already."""
+        self.read()
+        elapsed = np.float32(self.elapsed())
+        self.state = self.state.replace(
+            elapsed=parallel.place(elapsed, self.state.elapsed.sharding)
+        )
+        if self.step != self.saved_step:
+            self.checkpoints.save(self.step, self.state, {"metrics": self.metrics.to_dict()})
+            self.saved_step = self.step
+        self.saved_at = time.monotonic()
+
+    @contextmanager
+    def display(self) -> Iterator[Callable[[], None]]:
+        """The progress display, in steps or in seconds; yields what brings it up to date."""
+        config = self.config
+        if config.steps is not None:
+            title, total = "training", config.steps
+        else:
+            assert config.minutes is not None
+            title, total = "training (seconds)", math.ceil(60.0 * config.minutes)
+
+        def done() -> int:
+            return self.step if config.steps is not None else min(int(self.elapsed()), total)
+
+        if jax.process_index() != 0:
+            yield lambda: None
+            return
+        shown = done()
+        with progress_display(title, total=total, start=shown) as bar:
+
+            def show() -> None:
+                nonlocal shown
+                now = done()
+                values: dict[str, float | str] = {"step": str(self.step)}
+                if math.isfinite(self.metrics.loss):
+                    values["loss"] = self.metrics.loss
+                if math.isfinite(self.metrics.rate):
+                    values["rate"] = f"{self.metrics.rate:.0f} samples/s"
+                bar.update(now - shown, **values)
+                shown = now
+
+            yield show
+
+
+def check_configuration(directory: Path, configuration: dict[str, Any]) -> None:
+    """Keep the configuration of a run in its directory, and hold a resumed run to it.
+
+    Args:
+      directory: the run directory; created.
+      configuration: nested dict that JSON can hold.
+
+    Raises:
+      CaperError: the directory is of a run with another configuration; names what differs.
+    """
+    path = directory / "config.json"
+    text = json.dumps(configuration, indent=2, sort_keys=True)
+    if path.exists():
+        try:
+            saved = _flatten(json.loads(path.read_text(encoding="utf-8")))
+        except ValueError as error:
+            raise CaperError(f"{path} is not valid JSON: {error}") from error
+        given = _flatten(json.loads(text))
+        different = [
+            f"{key} ({saved.get(key, 'absent')!r} there, {given.get(key, 'absent')!r} now)"
+            for key in sorted(saved.keys() | given.keys())
+            if key not in _FREE_KEYS and saved.get(key, _ABSENT) != given.get(key, _ABSENT)
+        ]
+        if different:
+            raise CaperError(
+                f"{directory} holds a run of another configuration: {', '.join(different)}; "
+                "use its configuration to resume it, or another directory"
+            )
+        return
+    if jax.process_index() == 0:
+        directory.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, text.encode() + b"\n")
+
+
+_ABSENT = object()
+
+
+def _flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested dicts as {"a.b.c": value}."""
+    if not isinstance(tree, dict) or not tree:
+        return {prefix: tree}
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat.update(_flatten(value, f"{prefix}.{key}" if prefix else key))
+    return flat
+
+
+class _StopRequest:
+    """Turns SIGTERM and the first Ctrl-C into a request to save and stop.
+
+    A second Ctrl-C interrupts at once. Outside the main thread signals are left alone.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> _StopRequest:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGINT):
+                self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: Any) -> None:
+        if self.requested and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.requested = True
