@@ -21,15 +21,15 @@ class Cloud:
 
     Attributes:
       points: [N, 3] float32 metres, camera frame.
-      pixels: [N, 2] int32 (v, u) of every point; None when the source is no image.
-      index: [N] int64 row of every point among the source's usable points; None for an image.
+      pixels: [N, 2] int32 (v, u) of every point; [0, 2] when the source is no image.
+      index: [N] int64 row of every point in the source (of an image: in raster order).
       available: number of usable points in the source; fewer than N means repeated points.
       dropped: number of points or masked pixels left out: no measurement, or too far away.
     """
 
     points: np.ndarray
-    pixels: np.ndarray | None
-    index: np.ndarray | None
+    pixels: np.ndarray
+    index: np.ndarray
     available: int
     dropped: int
 
@@ -96,15 +96,19 @@ def cloud_from_depth(
             f"none of the {len(rows)} masked pixels has valid depth (all zero or NaN); the object "
             "is too close, too far or reflective, or mask and depth do not belong together"
         )
-    points = back_project(rows[valid], columns[valid], z[valid], intrinsics)
-    pixels = np.stack([rows[valid], columns[valid]], axis=-1).astype(np.int32)
-    if radius is not None:
-        near = _near(points, radius)
-        points, pixels = points[near], pixels[near]
-    _check_count(len(points), f"of {len(rows)} masked pixels")
-    picked = systematic_indices(len(points), num_points, seed)
-    dropped = len(rows) - len(points)
-    return Cloud(points[picked], pixels[picked], None, len(points), dropped)
+    rows, columns, z = rows[valid], columns[valid], z[valid]
+    points = back_project(rows, columns, z, intrinsics)
+    kept = np.arange(len(points)) if radius is None else _near(points, radius)
+    _check_count(len(kept), f"of {len(valid)} masked pixels")
+    picked = kept[systematic_indices(len(kept), num_points, seed)]
+    pixels = np.stack([rows[picked], columns[picked]], axis=-1)
+    return Cloud(
+        points=points[picked],
+        pixels=pixels.astype(np.int32),
+        index=pixels @ (depth.shape[1], 1),
+        available=len(kept),
+        dropped=len(valid) - len(kept),
+    )
 
 
 def back_project(
@@ -129,7 +133,8 @@ def sample_points(
     """Picks ``num_points`` of a raw cloud, in its own order.
 
     Args:
-      points: [N, 3] metres, camera frame; rows with NaN or infinity are dropped and counted.
+      points: [N, 3] metres, camera frame; rows with NaN or infinity, and rows of zeros (no
+        measurement in an organised cloud) are dropped and counted.
       num_points: points to return; smaller clouds are repeated evenly.
       seed: see ``systematic_indices``.
       radius: see ``cloud_from_depth``.
@@ -165,14 +170,21 @@ def sample_points(
         kept = kept[_near(cast[kept], radius)]
         _check_count(len(kept), f"of {len(points)} points in {where}")
     index = kept[systematic_indices(len(kept), num_points, seed)]
-    return Cloud(cast[index], None, index, len(kept), len(points) - len(kept))
+    return Cloud(
+        points=cast[index],
+        pixels=np.zeros((0, 2), np.int32),
+        index=index,
+        available=len(kept),
+        dropped=len(points) - len(kept),
+    )
 
 
 def _near(points: np.ndarray, radius: float) -> np.ndarray:
-    """[N] bool: within ``radius`` of the median point, which a minority of outliers cannot move."""
+    """Rows within ``radius`` of the median point, which a minority of outliers cannot move."""
     if not radius > 0:
         raise CaperError(f"radius must be positive metres, got {radius}")
-    return np.linalg.norm(points - np.median(points, axis=0), axis=-1) <= radius
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=-1)
+    return np.flatnonzero(distance <= radius)
 
 
 def _check_count(count: int, source: str) -> None:

@@ -149,7 +149,7 @@ class Hdf5Dataset:
         _check_arrays(str(path), arrays, self.category)
         self.split = str(self.attributes["split"])
         self.mask_source = str(self.attributes["mask_source"])
-        self.names: list[str] = [name.decode() for name in arrays.pop("name")]
+        self.names: Sequence[str] = [name.decode() for name in arrays.pop("name")]
         self._arrays = arrays
 
     def __len__(self) -> int:

@@ -93,11 +93,11 @@ def read_mask(path: str | Path) -> np.ndarray:
         raise CaperError(f"{path}: a mask must be an image, got an array of shape {raw.shape}")
     threshold = 127 if Path(path).suffix.lower() in (".jpg", ".jpeg") else 0
     if raw.ndim == 2:
-        mask = raw > threshold
+        mask = np.asarray(raw > threshold)
     elif raw.shape[-1] == 3:
-        mask = (raw > threshold).any(-1)
+        mask = np.any(raw > threshold, axis=-1)
     else:
-        mask = (raw[..., :-1] > threshold).any(-1) & (raw[..., -1] > 0)
+        mask = np.any(raw[..., :-1] > threshold, axis=-1) & (raw[..., -1] > 0)
     if not mask.any():
         raise CaperError(f"{path}: the mask is empty (all black); no object to estimate")
     return mask
