@@ -11,13 +11,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.errors import CaperError
 from caper_jax.visualization.scene import (
     BOX_EDGES,
+    NEAREST,
     Scene,
     box_corners,
+    crop_box,
+    depth_range,
     format_state,
     hidden_edges,
     joint_name,
@@ -29,9 +33,8 @@ from caper_jax.visualization.scene import (
 TITLES = ("Depth image and mask", "Estimate over the depth image", "Seen from another side")
 DPI = 110
 ROW_HEIGHT = 3.9  # inches
-WIDTHS = (3.4, 3.4, 3.4, 3.0)  # inches: three views and the legend
+WIDTHS = (3.4, 3.4, 3.4, 3.3)  # inches: three views and the legend
 INK, PAPER, TRUTH = "#1a1a1a", "#f4f4f2", "#333333"
-NEAREST = 1e-3  # metres; what is nearer to the camera's plane has no place in its image
 
 Projection = Callable[[np.ndarray], np.ndarray]
 
@@ -83,7 +86,7 @@ def write_picture(path: str | Path, scenes: Sequence[Scene]) -> Path:
 def _draw_input(axes: Axes, scene: Scene) -> None:
     """The depth image around the object; without an image, the points by distance."""
     _frame(axes)
-    near, far = _depth_range(scene)
+    near, far = depth_range(scene)
     colors = matplotlib.colormaps["viridis_r"].with_extremes(bad="#d9d9d9")
     if scene.depth is None:
         pixels = project(scene.points, _intrinsics(scene))
@@ -97,11 +100,12 @@ def _draw_input(axes: Axes, scene: Scene) -> None:
         if scene.mask is not None and scene.mask.any() and not scene.mask.all():
             for width, color in ((2.6, "black"), (1.2, "white")):
                 axes.contour(scene.mask.astype(float), [0.5], colors=color, linewidths=width)
-    _crop(axes, scene)
+    _limit(axes, *crop_box(scene))
     bar = axes.inset_axes((0.0, -0.055, 1.0, 0.03))
     axes.figure.colorbar(shown, cax=bar, orientation="horizontal", extend="both")
+    bar.xaxis.set_major_locator(MaxNLocator(4))
+    bar.xaxis.set_major_formatter("{x:g} m")
     bar.tick_params(labelsize=8, length=2, pad=1)
-    bar.text(1.0, -3.2, "m", fontsize=8, ha="right", va="center", transform=bar.transAxes)
 
 
 def _draw_estimate(axes: Axes, scene: Scene) -> None:
@@ -109,7 +113,7 @@ def _draw_estimate(axes: Axes, scene: Scene) -> None:
     _frame(axes)
     axes.set_facecolor(PAPER)
     if scene.depth is not None:
-        near, far = _depth_range(scene)
+        near, far = depth_range(scene)
         image = np.where(np.nan_to_num(scene.depth) > 0, scene.depth, np.nan)
         axes.imshow(image, cmap="gray_r", vmin=near, vmax=far, alpha=0.35, interpolation="nearest")
     intrinsics = _intrinsics(scene)
@@ -120,7 +124,7 @@ def _draw_estimate(axes: Axes, scene: Scene) -> None:
         return project(seen, intrinsics)
 
     _draw_objects(axes, scene, flat, eye=np.zeros(3), far_first=np.argsort(-scene.points[:, 2]))
-    _crop(axes, scene)
+    _limit(axes, *crop_box(scene))
 
 
 def _draw_side(axes: Axes, scene: Scene) -> None:
@@ -138,7 +142,8 @@ def _draw_side(axes: Axes, scene: Scene) -> None:
     _draw_objects(axes, scene, flat, eye=middle - 1e3 * forward, far_first=far_first)
     shown = [flat(scene.points), flat(box_corners(scene.pose)).reshape(-1, 2)]
     extent = np.concatenate(shown)
-    _square_limits(axes, extent.min(0), extent.max(0), margin=0.14)
+    center, half = (extent.min(0) + extent.max(0)) / 2, 0.64 * np.ptp(extent, axis=0).max()
+    _limit(axes, center - half, center + half)
     _draw_scale(axes)
 
 
@@ -148,7 +153,7 @@ def _draw_objects(
     """Points, boxes and joint axes through one projection."""
     colors = np.array([part_color(part) for part in range(scene.category.num_parts)])
     points = flat(scene.points)[far_first]
-    axes.scatter(*points.T, c=colors[scene.labels[far_first]], s=5, linewidths=0, alpha=0.55)
+    axes.scatter(*points.T, c=colors[scene.labels[far_first]], s=5, linewidths=0, alpha=0.75)
     halo = [effects.withStroke(linewidth=3.4, foreground="white", alpha=0.8)]
     if scene.truth is not None:
         for corners in box_corners(scene.truth):
@@ -208,7 +213,7 @@ def _draw_legend(axes: Axes, scene: Scene) -> None:
         rows.append(("truth", TRUTH, "ground truth"))
     pitch = min(0.095, 0.9 / (len(rows) + 1))
     axes.set_ylim(1, 0)
-    axes.text(0.05, 0.045, scene.name, fontsize=12, fontweight="bold", color=INK, va="center")
+    axes.text(0.05, 0.045, scene.name, fontsize=13, fontweight="bold", color=INK, va="center")
     for index, (kind, color, text) in enumerate(rows):
         y = 0.05 + pitch * (index + 1.1)
         if kind == "part":
@@ -218,7 +223,7 @@ def _draw_legend(axes: Axes, scene: Scene) -> None:
             axes.annotate("", xy=(0.135, y), xytext=(0.045, y), arrowprops=arrow)
         else:
             axes.plot([0.045, 0.135], [y, y], color=color, linewidth=1, linestyle=(0, (5, 3)))
-        axes.text(0.17, y, text, fontsize=10, color=INK, va="center", parse_math=False)
+        axes.text(0.17, y, text, fontsize=11, color=INK, va="center", parse_math=False)
 
 
 def _draw_scale(axes: Axes) -> None:
@@ -235,53 +240,47 @@ def _draw_scale(axes: Axes) -> None:
 
 
 def _side_view(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit right, down and forward vectors of a viewer 65 degrees round the object, 25 above."""
+    """Unit right, down and forward vectors of a viewer 25 degrees above the object.
+
+    Of several directions around it, at least 50 degrees from the camera's, the one in which no
+    part is seen edge-on.
+    """
     root = np.asarray(scene.pose.rotation, float)[0]
     up = root[:, "xyz".index(scene.category.viewpoint.up)]
-    toward = box_corners(scene.pose).reshape(-1, 3).mean(0)
+    corners = box_corners(scene.pose)
+    toward = corners.reshape(-1, 3).mean(0)
     level = toward - np.dot(toward, up) * up
     if np.linalg.norm(level) < 0.1 * np.linalg.norm(toward):  # seen from straight above
-        level = -root[:, 2] + np.dot(root[:, 2], up) * up
+        level = root[:, 0] - np.dot(root[:, 0], up) * up
     level /= max(np.linalg.norm(level), 1e-9)
-    azimuth, elevation = np.radians(65), np.radians(25)
-    level = np.cos(azimuth) * level + np.sin(azimuth) * np.cross(up, level)
-    forward = np.cos(elevation) * level - np.sin(elevation) * up
-    right = np.cross(forward, up)
+    elevation = np.radians(25)
+
+    def forward(azimuth: float) -> np.ndarray:
+        turned = np.cos(azimuth) * level + np.sin(azimuth) * np.cross(up, level)
+        return np.cos(elevation) * turned - np.sin(elevation) * up
+
+    # A box shows each pair of faces by their area times the cosine of the viewing angle.
+    edges = corners[:, [4, 2, 1]] - corners[:, :1]
+    areas = np.cross(edges[:, [0, 1, 2]], edges[:, [1, 2, 0]])
+    most = np.maximum(np.linalg.norm(areas, axis=-1).max(-1), 1e-12)
+
+    def clearest(azimuth: float) -> float:
+        return float((np.abs(areas @ forward(azimuth)).sum(-1) / most).min())
+
+    chosen = forward(max(np.radians([65, -65, 50, -50, 95, -95]), key=clearest))
+    right = np.cross(chosen, up)
     right /= np.linalg.norm(right)
-    return right, np.cross(forward, right), forward
-
-
-def _depth_range(scene: Scene) -> tuple[float, float]:
-    """Depths that the colours span: those of the object and half as much again on both sides."""
-    near, far = np.percentile(scene.points[:, 2], (1, 99))
-    reach = max(0.5 * (far - near), 0.01)
-    return float(near - reach), float(far + reach)
+    return right, np.cross(chosen, right), chosen
 
 
 def _intrinsics(scene: Scene) -> np.ndarray:
     return np.eye(3) if scene.intrinsics is None else np.asarray(scene.intrinsics, float)
 
 
-def _crop(axes: Axes, scene: Scene) -> None:
-    """Limits the image to the object and the estimate, but not to a wildly wrong one."""
-    intrinsics = _intrinsics(scene)
-    pixels = project(scene.points, intrinsics)
-    low, high = pixels.min(0), pixels.max(0)
-    corners = box_corners(scene.pose).reshape(-1, 3)
-    corners = project(corners[corners[:, 2] > NEAREST], intrinsics)
-    most = (high - low).max()
-    if len(corners):
-        low = np.maximum(np.minimum(low, corners.min(0)), low - most)
-        high = np.minimum(np.maximum(high, corners.max(0)), high + most)
-    _square_limits(axes, low, high, margin=0.12)
-
-
-def _square_limits(axes: Axes, low: np.ndarray, high: np.ndarray, margin: float) -> None:
-    """Equal limits in x and y, y downwards, the box (low, high) in the middle."""
-    middle = (low + high) / 2
-    half = max(float((high - low).max()) * (0.5 + margin), 1e-6)
-    axes.set_xlim(middle[0] - half, middle[0] + half)
-    axes.set_ylim(middle[1] + half, middle[1] - half)
+def _limit(axes: Axes, low: np.ndarray, high: np.ndarray) -> None:
+    """Shows the square from ``low`` to ``high``, y downwards."""
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(high[1], low[1])
     axes.set_aspect("equal")
 
 

@@ -26,6 +26,10 @@ BOX_EDGES = tuple(
     for b in range(a + 1, 8)
     if np.sum(CORNER_SIGNS[a] != CORNER_SIGNS[b]) == 1
 )
+# Four corners of every face, in turn around it: those with x = -1, x = 1, y = -1, ...
+BOX_FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
+
+NEAREST = 1e-3  # metres; what is nearer to the camera's plane has no place in its image
 
 
 @dataclass(frozen=True)
@@ -150,22 +154,49 @@ def hidden_edges(corners: np.ndarray, eye: np.ndarray) -> np.ndarray:
       [12] bool in ``BOX_EDGES`` order: both faces at the edge look away from the viewer.
     """
     middle = corners.mean(0)
-    away = {}
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            face = corners[CORNER_SIGNS[:, axis] == sign].mean(0)
-            away[axis, sign] = np.dot(face - middle, face - eye) >= 0
-    hidden = []
-    for a, b in BOX_EDGES:
-        shared = np.flatnonzero(CORNER_SIGNS[a] == CORNER_SIGNS[b])
-        hidden.append(all(away[axis, CORNER_SIGNS[a, axis]] for axis in shared))
-    return np.array(hidden)
+    centers = [corners[list(face)].mean(0) for face in BOX_FACES]
+    away = [np.dot(center - middle, center - eye) >= 0 for center in centers]
+    beside = [
+        [is_away for is_away, face in zip(away, BOX_FACES, strict=True) if a in face and b in face]
+        for a, b in BOX_EDGES
+    ]
+    return np.array([all(faces) for faces in beside])
 
 
 def project(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """Pixels [..., 2] of camera points [..., 3] in front of the camera; pixel centres are whole."""
     image = np.asarray(points, float) @ np.asarray(intrinsics, float).T
     return image[..., :2] / image[..., 2:]
+
+
+def crop_box(scene: Scene, margin: float = 0.12) -> tuple[np.ndarray, np.ndarray]:
+    """The square of the image that shows the object and the estimate, but no wildly wrong one.
+
+    Args:
+      scene: without intrinsics, the image plane at 1 m stands for the image.
+      margin: share of the larger extent to add on all sides.
+
+    Returns:
+      (low [2], high [2]) pixels; may reach beyond the image.
+    """
+    intrinsics = np.eye(3) if scene.intrinsics is None else scene.intrinsics
+    pixels = project(scene.points, intrinsics)
+    low, high = pixels.min(0), pixels.max(0)
+    most = (high - low).max()
+    corners = box_corners(scene.pose).reshape(-1, 3)
+    corners = project(corners[corners[:, 2] > NEAREST], intrinsics)
+    if len(corners):
+        low = np.maximum(np.minimum(low, corners.min(0)), low - most)
+        high = np.minimum(np.maximum(high, corners.max(0)), high + most)
+    half = max(float((high - low).max()) * (0.5 + margin), 1e-6)
+    return (low + high) / 2 - half, (low + high) / 2 + half
+
+
+def depth_range(scene: Scene) -> tuple[float, float]:
+    """Depths that the colours span: those of the object and half as much again on both sides."""
+    near, far = np.percentile(np.asarray(scene.points)[:, 2], (1, 99))
+    reach = max(0.5 * (far - near), 0.01)
+    return float(near - reach), float(far + reach)
 
 
 def format_state(state: float, joint_type: str) -> str:
