@@ -44,7 +44,7 @@ def write_model(directory: str | Path, variables: PyTree, card: dict[str, Any]) 
     except (TypeError, ValueError) as error:
         raise CaperError(f"the model card cannot be written as JSON: {error}") from error
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     directory.mkdir(parents=True, exist_ok=True)
     write_atomically(directory / WEIGHTS_FILE, buffer.getvalue())
     write_atomically(directory / CARD_FILE, text.encode() + b"\n")

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,17 +19,13 @@ from caper_jax.errors import CaperError
 from caper_jax.progress import progress as progress_display
 from caper_jax.training import parallel
 from caper_jax.training.checkpoints import Checkpoints
-from caper_jax.training.export import write_atomically
 from caper_jax.training.metrics_log import MetricsLog
 from caper_jax.training.optimizer import Optimizer, OptimizerName, flat_and_anneal
+from caper_jax.training.run_directory import check_configuration
+from caper_jax.training.signals import StopRequest
 from caper_jax.training.state import LossFn, TrainState, make_step
 
 PyTree = Any
-
-# Keys of the configuration that a resumed run may change: they do not touch the result.
-_FREE_KEYS = frozenset(
-    {"training.checkpoint_minutes", "training.checkpoint_steps", "training.keep_checkpoints"}
-)
 
 
 @dataclass(frozen=True)
@@ -176,7 +169,7 @@ def fit(
 
     with (
         Checkpoints(directory / "checkpoints", keep=config.keep_checkpoints) as checkpoints,
-        _StopRequest() as stop,
+        StopRequest() as stop,
     ):
         state, extra = checkpoints.restore(state) or (state, {})
         return _Run(config, directory, checkpoints, stop, state, extra).go(step_fn, batch_of)
@@ -190,7 +183,7 @@ class _Run:
         config: TrainingConfig,
         directory: Path,
         checkpoints: Checkpoints,
-        stop: _StopRequest,
+        stop: StopRequest,
         state: TrainState,
         extra: dict[str, Any],
     ) -> None:
@@ -307,8 +300,8 @@ class _Run:
         """Write a checkpoint of the current step, unless it was written already."""
         self.read()
         elapsed = np.float32(self.elapsed())
-        self.state = self.state.replace(
-            elapsed=parallel.place(elapsed, self.state.elapsed.sharding)
+        self.state = dataclasses.replace(
+            self.state, elapsed=parallel.place(elapsed, self.state.elapsed.sharding)
         )
         if self.step != self.saved_step:
             self.checkpoints.save(self.step, self.state, {"metrics": self.metrics.to_dict()})
@@ -346,76 +339,3 @@ class _Run:
                 shown = now
 
             yield show
-
-
-def check_configuration(directory: Path, configuration: dict[str, Any]) -> None:
-    """Keep the configuration of a run in its directory, and hold a resumed run to it.
-
-    Args:
-      directory: the run directory; created.
-      configuration: nested dict that JSON can hold.
-
-    Raises:
-      CaperError: the directory is of a run with another configuration; names what differs.
-    """
-    path = directory / "config.json"
-    text = json.dumps(configuration, indent=2, sort_keys=True)
-    if path.exists():
-        try:
-            saved = _flatten(json.loads(path.read_text(encoding="utf-8")))
-        except ValueError as error:
-            raise CaperError(f"{path} is not valid JSON: {error}") from error
-        given = _flatten(json.loads(text))
-        different = [
-            f"{key} ({saved.get(key, 'absent')!r} there, {given.get(key, 'absent')!r} now)"
-            for key in sorted(saved.keys() | given.keys())
-            if key not in _FREE_KEYS and saved.get(key, _ABSENT) != given.get(key, _ABSENT)
-        ]
-        if different:
-            raise CaperError(
-                f"{directory} holds a run of another configuration: {', '.join(different)}; "
-                "use its configuration to resume it, or another directory"
-            )
-        return
-    if jax.process_index() == 0:
-        directory.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, text.encode() + b"\n")
-
-
-_ABSENT = object()
-
-
-def _flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested dicts as {"a.b.c": value}."""
-    if not isinstance(tree, dict) or not tree:
-        return {prefix: tree}
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        flat.update(_flatten(value, f"{prefix}.{key}" if prefix else key))
-    return flat
-
-
-class _StopRequest:
-    """Turns SIGTERM and the first Ctrl-C into a request to save and stop.
-
-    A second Ctrl-C interrupts at once. Outside the main thread signals are left alone.
-    """
-
-    def __init__(self) -> None:
-        self.requested = False
-        self._previous: dict[int, Any] = {}
-
-    def __enter__(self) -> _StopRequest:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGTERM, signal.SIGINT):
-                self._previous[number] = signal.signal(number, self._handle)
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, frame: Any) -> None:
-        if self.requested and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        self.requested = True

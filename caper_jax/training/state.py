@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -131,7 +132,8 @@ def make_step(
         def keep(new: PyTree, old: PyTree) -> PyTree:
             return jax.tree.map(lambda n, o: jnp.where(applied, n, o), new, old)
 
-        new = state.replace(
+        new = dataclasses.replace(
+            state,
             step=state.step + 1,
             params=keep(params, state.params),
             model_state=keep(model_state, state.model_state),

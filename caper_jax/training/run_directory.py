@@ -1,0 +1,64 @@
+"""What a run directory remembers of its run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from caper_jax.errors import CaperError
+from caper_jax.training.export import write_atomically
+
+# Keys of the configuration that a resumed run may change: they do not touch the result.
+_FREE_KEYS = frozenset(
+    {"training.checkpoint_minutes", "training.checkpoint_steps", "training.keep_checkpoints"}
+)
+
+
+def check_configuration(directory: Path, configuration: dict[str, Any]) -> None:
+    """Keep the configuration of a run in its directory, and hold a resumed run to it.
+
+    Args:
+      directory: the run directory; created.
+      configuration: nested dict that JSON can hold.
+
+    Raises:
+      CaperError: the directory is of a run with another configuration; names what differs.
+    """
+    path = directory / "config.json"
+    text = json.dumps(configuration, indent=2, sort_keys=True)
+    if path.exists():
+        try:
+            saved = _flatten(json.loads(path.read_text(encoding="utf-8")))
+        except ValueError as error:
+            raise CaperError(f"{path} is not valid JSON: {error}") from error
+        given = _flatten(json.loads(text))
+        different = [
+            f"{key} ({saved.get(key, 'absent')!r} there, {given.get(key, 'absent')!r} now)"
+            for key in sorted(saved.keys() | given.keys())
+            if key not in _FREE_KEYS and saved.get(key, _ABSENT) != given.get(key, _ABSENT)
+        ]
+        if different:
+            raise CaperError(
+                f"{directory} holds a run of another configuration: {', '.join(different)}; "
+                "use its configuration to resume it, or another directory"
+            )
+        return
+    if jax.process_index() == 0:
+        directory.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, text.encode() + b"\n")
+
+
+_ABSENT = object()
+
+
+def _flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested dicts as {"a.b.c": value}."""
+    if not isinstance(tree, dict) or not tree:
+        return {prefix: tree}
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat.update(_flatten(value, f"{prefix}.{key}" if prefix else key))
+    return flat
