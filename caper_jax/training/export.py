@@ -76,9 +76,18 @@ def read_model(directory: str | Path) -> tuple[dict[str, Any], PyTree]:
 
     path = directory / WEIGHTS_FILE
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        # From memory: np.load leaves the file open where it is damaged.
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            arrays = {name: np.asarray(file[name]) for name in file.files}
+    except (
+        ValueError,
+        TypeError,
+        OSError,
+        EOFError,
+        KeyError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         raise CaperError(f"{path} is damaged or not a weights file: {error}") from error
     for name, array in arrays.items():
         if array.dtype not in (np.float16, np.float32):
