@@ -7,7 +7,6 @@ of float32 at a largest error of 0.01 mm for objects below 0.6 m, where float16 
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -83,18 +82,16 @@ def write(
         "units": "metres, radians",
     }
 
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    os.close(handle)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with h5py.File(temporary, "w") as file:
             for key, array in arrays.items():
                 file.create_dataset(key, data=array)
             for key, value in facts.items():
                 file.attrs[key] = value
-        os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
     finally:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def check_writable(path: str | Path, overwrite: bool = False) -> None:
@@ -263,10 +260,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, bytes):
         return value.decode(errors="replace")
     return value.item() if isinstance(value, np.generic) else value
-
-
-def _umask() -> int:
-    """The process's umask, which ``mkstemp`` does not honour."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

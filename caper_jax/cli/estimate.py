@@ -1,0 +1,259 @@
+"""``caper estimate``: the pose of one object in your own depth image or point cloud."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from caper_jax.cli import common
+from caper_jax.errors import CaperError
+
+if TYPE_CHECKING:
+    from caper_jax.articulation.category import Category
+    from caper_jax.articulation.pose import ArticulatedPose
+    from caper_jax.data.cloud import Cloud
+
+FRAME = "camera, OpenCV: x right, y down, z forward; p_camera = rotation p + translation"
+NUM_POINTS = 1024
+
+
+@dataclass(frozen=True)
+class _Observation:
+    """The cloud to estimate from and, where it came from an image, the image."""
+
+    cloud: Cloud
+    depth: np.ndarray | None = None
+    mask: np.ndarray | None = None
+    intrinsics: np.ndarray | None = None
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = common.create_parser(
+        "estimate",
+        "Estimates the pose, size and joints of one object. The object is given by a depth image\n"
+        "with a mask or a 2D box (what stands on the table inside it), or as a point cloud.",
+        [
+            ("--category box --depth d.png --mask m.png --intrinsics cam.json", "prints the pose"),
+            (
+                "--category box --depth d.png --box 847,198,1204,489 --intrinsics cam.json "
+                "--picture pose.png",
+                "draws it",
+            ),
+            ("--category box --points cloud.ply --json pose.json", "writes it"),
+        ],
+    )
+    parser.add_argument("--category", required=True, help="category of the object, e.g. box")
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument(
+        "--depth", type=Path, help="16-bit PNG in millimetres, or float .npy [H, W] in metres"
+    )
+    source.add_argument(
+        "--points", type=Path, help="cloud of the object alone: .npy [N, 3] or .ply, metres"
+    )
+    region = parser.add_mutually_exclusive_group()
+    region.add_argument("--mask", type=Path, help="image of the same size, not black on the object")
+    region.add_argument("--box", type=_box, help="x1,y1,x2,y2 in pixels around the object")
+    parser.add_argument(
+        "--intrinsics", type=Path, help="camera as JSON: fx, fy, cx, cy, or K, or Open3D pinhole"
+    )
+    parser.add_argument(
+        "--depth-scale", type=common.positive_float, help="metres per unit of the depth image"
+    )
+    parser.add_argument("--json", type=Path, help="file to write the pose to")
+    parser.add_argument("--picture", type=Path, help="PNG to draw the pose in")
+    parser.add_argument("--page", type=Path, help="HTML page to turn the object and its joints")
+    parser.add_argument(
+        "--weights", type=Path, help="model directory (default: the shipped one of the category)"
+    )
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
+    from caper_jax import categories
+
+    category = categories.get(arguments.category)
+    _check_outputs(arguments)
+    observation = _observe(arguments)
+
+    from caper_jax import estimator as estimators
+
+    estimator = estimators.load(category.name, arguments.weights)
+    prediction = estimator(observation.cloud.points[None])
+    pose = _first(prediction.pose)
+    confidence = np.asarray(prediction.confidence)[0]
+    if not all(np.isfinite(value).all() for value in vars(pose).values()):
+        raise CaperError("the model gave no finite pose for this object; check mask and units")
+
+    cloud = observation.cloud
+    print(_format_pose(pose, category))
+    print(
+        f"confidence {' '.join(f'{value:.2f}' for value in confidence)}; {cloud.available} points, "
+        f"{cloud.dropped} dropped"
+    )
+    if arguments.json is not None:
+        from caper_jax.training.export import write_atomically
+
+        text = json.dumps(_as_json(pose, category, cloud, confidence), indent=2, allow_nan=False)
+        write_atomically(arguments.json, text.encode() + b"\n")
+    if arguments.picture is not None or arguments.page is not None:
+        labels = np.asarray(prediction.labels)[0]
+        _draw(arguments, category, observation, pose, labels)
+    return 0
+
+
+def _box(text: str) -> tuple[float, float, float, float]:
+    """Argument type: x1,y1,x2,y2."""
+    try:
+        x1, y1, x2, y2 = (float(value) for value in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not x1,y1,x2,y2 in pixels") from None
+    return x1, y1, x2, y2
+
+
+def _check_outputs(arguments: argparse.Namespace) -> None:
+    """Before any work: outputs that would overwrite an input or cannot be written."""
+    inputs = [arguments.depth, arguments.points, arguments.mask, arguments.intrinsics]
+    taken = {path.resolve(): path for path in inputs if path is not None}
+    for option in ("json", "picture", "page"):
+        path = getattr(arguments, option)
+        if path is None:
+            continue
+        if path.resolve() in taken:
+            raise CaperError(f"--{option} {path} would overwrite {taken[path.resolve()]}")
+        if path.is_dir():
+            raise CaperError(f"--{option} {path}: is a folder, give the name of a file")
+        if not path.parent.is_dir():
+            raise CaperError(f"--{option} {path}: the folder {path.parent} does not exist")
+        if not os.access(path.parent, os.W_OK):
+            raise CaperError(f"--{option} {path}: no permission to write in {path.parent}")
+        taken[path.resolve()] = path
+
+
+def _observe(arguments: argparse.Namespace) -> _Observation:
+    from caper_jax.data.cloud import cloud_from_depth, read_points, sample_points
+
+    if arguments.points is not None:
+        for option in ("mask", "box", "intrinsics", "depth_scale"):
+            if getattr(arguments, option) is not None:
+                raise CaperError(f"--{option.replace('_', '-')} goes with --depth, not --points")
+        points = read_points(arguments.points)
+        return _Observation(sample_points(points, NUM_POINTS, where=str(arguments.points)))
+
+    from caper_jax.data.images import read_depth, read_intrinsics, read_mask
+    from caper_jax.data.plane import mask_from_box
+
+    if arguments.mask is None and arguments.box is None:
+        raise CaperError("--depth needs --mask or --box to say where the object is")
+    if arguments.intrinsics is None:
+        raise CaperError("--depth needs --intrinsics, the camera as JSON (fx, fy, cx, cy)")
+    depth = read_depth(arguments.depth, arguments.depth_scale)
+    intrinsics = read_intrinsics(arguments.intrinsics, (depth.shape[0], depth.shape[1]))
+    if arguments.mask is not None:
+        mask = read_mask(arguments.mask)
+    else:
+        mask = mask_from_box(depth, intrinsics, arguments.box)
+    cloud = cloud_from_depth(depth, mask, intrinsics, NUM_POINTS)
+    return _Observation(cloud, depth, mask, intrinsics)
+
+
+def _first(pose: ArticulatedPose) -> ArticulatedPose:
+    import jax
+
+    return jax.tree.map(lambda array: np.asarray(array)[0], pose)
+
+
+def _format_pose(pose: ArticulatedPose, category: Category) -> str:
+    """Tables of parts and joints; metres, degrees."""
+    import jax
+
+    from caper_jax.evaluation.report import align
+    from caper_jax.geometry import so3
+
+    with jax.enable_x64(True):
+        turns = np.degrees(np.asarray(so3.log(pose.rotation.astype(np.float64))))
+    rows = [["part", "position [m]", "rotation vector [deg]", "size [m]"]]
+    for k, name in enumerate(category.parts):
+        rows.append(
+            [name, _triple(pose.translation[k], 3), _triple(turns[k], 1), _triple(pose.size[k], 3)]
+        )
+    lines = align(rows)
+    rows = [["joint", "state", "axis (root frame)", "pivot [m]"]]
+    for j, joint in enumerate(category.joints):
+        state, unit = _state(pose, category, j)
+        pivot = _triple(pose.joint_pivot[j], 3) if joint.type == "revolute" else "-"
+        rows.append(
+            [category.parts[j + 1], f"{state:.4g} {unit}", _triple(pose.joint_axis[j], 3), pivot]
+        )
+    return "\n".join([*lines, "", *align(rows)])
+
+
+def _state(pose: ArticulatedPose, category: Category, joint: int) -> tuple[float, str]:
+    """State of a joint in the unit of files and tables."""
+    value = float(pose.joint_state[joint])
+    if category.joint_types[joint] == "revolute":
+        return float(np.degrees(value)), "degrees"
+    return value, "metres"
+
+
+def _triple(values: np.ndarray, digits: int) -> str:
+    return " ".join(f"{value:.{digits}f}" for value in values)
+
+
+def _as_json(
+    pose: ArticulatedPose, category: Category, cloud: Cloud, confidence: np.ndarray
+) -> dict[str, Any]:
+    """The pose under the names of ``ArticulatedPose``; joint states in degrees or metres."""
+    states = [_state(pose, category, j) for j in range(category.num_joints)]
+    values = {key: np.asarray(value, float).tolist() for key, value in vars(pose).items()}
+    values["joint_state"] = [value for value, _ in states]
+    return {
+        "category": category.name,
+        "parts": list(category.parts),
+        "joint_types": list(category.joint_types),
+        "frame": FRAME,
+        "units": {"length": "metres", "joint_state": [unit for _, unit in states]},
+        "pose": values,
+        "confidence": confidence.tolist(),
+        "points": {"available": cloud.available, "dropped": cloud.dropped},
+    }
+
+
+def _draw(
+    arguments: argparse.Namespace,
+    category: Category,
+    observation: _Observation,
+    pose: ArticulatedPose,
+    labels: np.ndarray,
+) -> None:
+    from caper_jax.visualization.scene import Scene
+
+    depth = observation.depth
+    source: Path = arguments.depth or arguments.points
+    scene = Scene(
+        name=source.name,
+        category=category,
+        points=observation.cloud.points,
+        labels=labels,
+        pose=pose,
+        depth=None if depth is None else np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0),
+        mask=observation.mask,
+        intrinsics=observation.intrinsics,
+    )
+    if arguments.picture is not None:
+        from caper_jax.visualization.picture import write_picture
+
+        write_picture(arguments.picture, [scene])
+    if arguments.page is not None:
+        from caper_jax.visualization.page import write_page
+
+        write_page(arguments.page, [scene])

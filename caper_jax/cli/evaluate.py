@@ -1,0 +1,89 @@
+"""``caper evaluate``: measures a model on labelled data."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from caper_jax.cli import common
+from caper_jax.errors import CaperError
+
+PREDICTORS = ("model", "truth", "mean")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = common.create_parser(
+        "evaluate",
+        "Estimates every frame of a labelled dataset. Writes metrics.json (mean and median of every\n"
+        "error, failed frames included) and predictions.npz (every estimate) to a folder.",
+        [
+            ("--category box --data ReArtMix --format reartmix --out outputs/box", "real frames"),
+            ("--category box --data box_test.h5 --format caper --out outputs/box", "generated"),
+        ],
+    )
+    parser.add_argument("--category", required=True, help="category of the objects, e.g. box")
+    parser.add_argument("--data", required=True, type=Path, help="dataset's root folder or .h5")
+    parser.add_argument("--format", required=True, help="layout of the data: caper or reartmix")
+    parser.add_argument("--split", help="split to read (default: all there is)")
+    parser.add_argument(
+        "--predictor",
+        default="model",
+        choices=PREDICTORS,
+        help="the model, the dataset's own truth (must score perfectly), or the mean of the "
+        "training set (what any model must beat)",
+    )
+    parser.add_argument(
+        "--weights", type=Path, help="model directory (default: the shipped one of the category)"
+    )
+    parser.add_argument(
+        "--limit", type=common.positive_int, help="at most so many frames, from the first"
+    )
+    parser.add_argument("--out", required=True, type=Path, help="folder for the results")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
+    from caper_jax import categories
+    from caper_jax.data import open_dataset
+    from caper_jax.evaluation import protocol, report
+
+    category = categories.get(arguments.category)
+    _check_folder(arguments.out)
+    dataset = open_dataset(arguments.format, arguments.data, category.name, arguments.split)
+    weights = None
+    predictor: protocol.Predictor = protocol.truth_predictor
+    if arguments.predictor != "truth":
+        from caper_jax import estimator as estimators
+
+        estimator = estimators.load(category.name, arguments.weights)
+        weights = str(arguments.weights or f"shipped with the package ({category.name})")
+        if arguments.predictor == "model":
+            predictor = protocol.model_predictor(estimator)
+        elif "mean_pose" in estimator.card:
+            predictor = protocol.mean_predictor(category, estimator.card["mean_pose"], weights)
+        else:
+            raise CaperError(f"model {weights}: its card has no mean_pose; choose another model")
+
+    evaluation = protocol.evaluate(dataset, predictor, arguments.limit)
+    result = report.summarise(evaluation, dataset, arguments.predictor, weights)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    report.write_report(arguments.out, evaluation, result)
+    print(report.format_report(result))
+    print(f"\nwritten: {arguments.out / report.METRICS_FILE}, {report.PREDICTIONS_FILE}")
+    return 0
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuses, before any work, a folder that cannot be made or written in."""
+    existing = folder
+    while not existing.exists():
+        existing = existing.parent
+    if not existing.is_dir():
+        raise CaperError(f"--out {folder}: {existing} is a file; give a folder")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise CaperError(f"--out {folder}: no permission to write in {existing}")

@@ -1,0 +1,234 @@
+"""Errors of estimated poses, frame by frame, as the conventions define them.
+
+Everything is computed in float64; rotations by the atan2 form, so that the ground truth scored
+against itself reads 0 degrees, 0 metres and an IoU of 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from caper_jax.articulation.category import Category, Equivalence
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.data.schema import pose_shapes
+from caper_jax.errors import CaperError
+from caper_jax.geometry import boxes, linalg, so3
+
+FAILED_ROTATION_DEG = 180.0
+# What a frame without an estimate scores, in the words of the report.
+FAILURE_VALUES = {
+    "rotation_deg": FAILED_ROTATION_DEG,
+    "translation_m": "distance of the true part origin from the camera",
+    "iou_full": 0.0,
+    "iou_size": 0.0,
+    "axis_deg": FAILED_ROTATION_DEG,
+    "pivot_m": "distance of the true joint axis from the camera",
+    "state": "width of the category's range of states",
+}
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Errors of F frames.
+
+    Attributes:
+      rotation_deg: [F, K] geodesic angle, never folded.
+      translation_m: [F, K] distance of the part origins.
+      iou_full: [F, K] IoU of the oriented boxes in the camera frame.
+      iou_size: [F, K] IoU of the boxes' sizes alone, as if they shared centre and rotation.
+      axis_deg: [F, J] angle of the joint axes in the root's frame; the sign counts.
+      pivot_m: [F, J] distance of the estimated pivot from the true axis; NaN for prismatic joints.
+      state: [F, J] degrees (revolute) or metres (prismatic).
+    """
+
+    rotation_deg: np.ndarray
+    translation_m: np.ndarray
+    iou_full: np.ndarray
+    iou_size: np.ndarray
+    axis_deg: np.ndarray
+    pivot_m: np.ndarray
+    state: np.ndarray
+
+
+PART_METRICS = ("rotation_deg", "translation_m", "iou_full", "iou_size")
+JOINT_METRICS = ("axis_deg", "pivot_m", "state")
+
+
+def pose_errors(
+    estimate: ArticulatedPose,
+    truth: ArticulatedPose,
+    category: Category,
+    failed: np.ndarray | None = None,
+) -> PoseErrors:
+    """Errors of estimates against the truth, without regard to symmetries.
+
+    Args:
+      estimate: arrays [F, K, ...]; whatever it holds for failed frames is not looked at.
+      truth: arrays [F, K, ...].
+      category: joint types and state limits.
+      failed: [F] bool, frames without an estimate; they score ``FAILURE_VALUES``.
+
+    Raises:
+      CaperError: estimates of other shapes than the truth, or not finite although not failed.
+    """
+    true = _as_double(truth, "truth", category, None)
+    frames = len(true["rotation"])
+    lost = np.zeros(frames, bool) if failed is None else np.asarray(failed, bool)
+    guess = _as_double(estimate, "estimate", category, lost)
+    if len(guess["rotation"]) != frames:
+        raise CaperError(f"{len(guess['rotation'])} estimates for {frames} frames")
+
+    with jax.enable_x64(True):
+        errors = {key: np.array(value) for key, value in _errors(guess, true).items()}
+    revolute = np.array([kind == "revolute" for kind in category.joint_types], bool)
+    errors["pivot_m"][:, ~revolute] = np.nan
+    errors["state"][:, revolute] = np.degrees(errors["state"][:, revolute])
+
+    for key in ("rotation_deg", "axis_deg"):
+        errors[key][lost] = FAILED_ROTATION_DEG
+    for key in ("iou_full", "iou_size"):
+        errors[key][lost] = 0.0
+    errors["translation_m"][lost] = np.linalg.norm(true["translation"], axis=-1)[lost]
+    errors["pivot_m"][lost] = np.where(revolute, _axis_distance(true), np.nan)[lost]
+    widths = np.array([joint.limits[1] - joint.limits[0] for joint in category.joints])
+    errors["state"][lost] = np.where(revolute, np.degrees(widths), widths)
+    return PoseErrors(**errors)
+
+
+def pose_errors_up_to_symmetry(
+    estimate: ArticulatedPose,
+    truth: ArticulatedPose,
+    category: Category,
+    failed: np.ndarray | None = None,
+) -> PoseErrors:
+    """Errors against the better of the category's declared readings of the truth.
+
+    Better is the reading, frame by frame, whose root is turned less from the estimate's; all
+    errors of the frame are those against that reading.
+
+    Args and errors as for ``pose_errors``.
+    """
+    readings = [truth, *(equivalent_reading(truth, e, category) for e in category.equivalences)]
+    scores = [pose_errors(estimate, reading, category, failed) for reading in readings]
+    best = np.argmin([score.rotation_deg[:, 0] for score in scores], axis=0)
+    frames = np.arange(len(best))
+    return PoseErrors(
+        **{
+            field.name: np.stack([getattr(score, field.name) for score in scores])[best, frames]
+            for field in fields(PoseErrors)
+        }
+    )
+
+
+def equivalent_reading(
+    pose: ArticulatedPose, equivalence: Equivalence, category: Category
+) -> ArticulatedPose:
+    """The second reading of the same object: ``T'_k = T_permutation[k] S``.
+
+    The relative motion of two parts becomes ``S^-1 J S``: axes and pivots turn by S^-1, and an
+    axis also changes sign where parent and child change places, so that the states stay.
+
+    Args:
+      pose: arrays [..., K, ...].
+      equivalence: one of the category's.
+      category: gives the tree of parts.
+
+    Raises:
+      CaperError: the permutation joins parts that no joint joins.
+    """
+    order = list(equivalence.permutation)
+    turn = np.array(equivalence.turn)
+    joints, signs = _matching_joints(order, category)
+    arrays = {
+        key: np.asarray(getattr(pose, key), np.float64) for key in pose_shapes(category.num_parts)
+    }
+    return ArticulatedPose(
+        rotation=arrays["rotation"][..., order, :, :] @ turn,
+        translation=arrays["translation"][..., order, :],
+        size=arrays["size"][..., order, :] @ np.abs(turn),
+        box_center=arrays["box_center"][..., order, :] @ turn,
+        joint_axis=signs[:, None] * (arrays["joint_axis"][..., joints, :] @ turn),
+        joint_pivot=arrays["joint_pivot"][..., joints, :] @ turn,
+        joint_state=arrays["joint_state"][..., joints],
+    )
+
+
+def _matching_joints(order: list[int], category: Category) -> tuple[list[int], np.ndarray]:
+    """For every joint of the second reading, the joint of the first and +1, or -1 if reversed."""
+    joint_of = {(parent, j + 1): j for j, parent in enumerate(category.parents)}
+    joints, signs = [], []
+    for j, parent in enumerate(category.parents):
+        ends = order[parent], order[j + 1]
+        if ends in joint_of:
+            joints.append(joint_of[ends])
+            signs.append(1.0)
+        elif ends[::-1] in joint_of:
+            joints.append(joint_of[ends[::-1]])
+            signs.append(-1.0)
+        else:
+            raise CaperError(
+                f"category {category.name!r}: equivalence {tuple(order)} puts a joint between "
+                f"parts {ends[0]} and {ends[1]}, which have none"
+            )
+    return joints, np.array(signs)
+
+
+@jax.jit
+def _errors(guess: dict[str, jax.Array], true: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """All metrics but the failures; states and angles in radians where the joint is revolute."""
+    rotation = so3.geodesic_distance(guess["rotation"], true["rotation"])
+    full = boxes.iou_full(
+        guess["rotation"],
+        _box_center(guess),
+        guess["size"],
+        true["rotation"],
+        _box_center(true),
+        true["size"],
+    )
+    sine = linalg.norm(jnp.cross(guess["joint_axis"], true["joint_axis"]))
+    cosine = jnp.sum(guess["joint_axis"] * true["joint_axis"], -1)
+    offset = guess["joint_pivot"] - true["joint_pivot"]
+    return {
+        "rotation_deg": jnp.degrees(rotation),
+        "translation_m": linalg.norm(guess["translation"] - true["translation"]),
+        "iou_full": full,
+        "iou_size": boxes.iou_size(guess["size"], true["size"]),
+        "axis_deg": jnp.degrees(jnp.arctan2(sine, cosine)),
+        "pivot_m": linalg.norm(jnp.cross(offset, true["joint_axis"])),
+        "state": jnp.abs(guess["joint_state"] - true["joint_state"]),
+    }
+
+
+def _box_center(arrays: dict[str, jax.Array]) -> jax.Array:
+    """[..., K, 3] centres of the parts' boxes in the camera frame."""
+    return linalg.apply(arrays["rotation"], arrays["box_center"]) + arrays["translation"]
+
+
+def _axis_distance(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """[F, J] metres from the camera to the joint axes, which rest in the root's frame."""
+    root = arrays["rotation"][:, None, 0]
+    axis = np.einsum("fjab,fjb->fja", root, arrays["joint_axis"])
+    pivot = np.einsum("fjab,fjb->fja", root, arrays["joint_pivot"])
+    pivot += arrays["translation"][:, None, 0]
+    return np.linalg.norm(np.cross(pivot, axis), axis=-1)
+
+
+def _as_double(
+    pose: ArticulatedPose, name: str, category: Category, lost: np.ndarray | None
+) -> dict[str, np.ndarray]:
+    """Fields [F, ...] in float64; failed frames get a harmless pose, which is not used."""
+    arrays = {}
+    for key, shape in pose_shapes(category.num_parts).items():
+        array = np.array(getattr(pose, key), np.float64)
+        if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
+            raise CaperError(f"{name} {key} has shape {array.shape}, expected (frames, *{shape})")
+        if lost is not None:
+            array[lost] = np.eye(3) if key == "rotation" else 1.0
+        if not np.isfinite(array).all():
+            raise CaperError(f"{name} {key} has NaN or infinite entries")
+        arrays[key] = array
+    return arrays

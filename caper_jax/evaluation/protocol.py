@@ -1,0 +1,188 @@
+"""Runs a predictor over a dataset: what is asked of it, in which batches, and what counts."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from caper_jax.articulation.category import Category
+from caper_jax.articulation.kinematics import forward_kinematics
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.data.cloud import MIN_POINTS, sample_points
+from caper_jax.data.schema import Dataset, Frame, pose_problems, pose_shapes
+from caper_jax.errors import CaperError
+from caper_jax.geometry import se3
+from caper_jax.progress import progress
+
+BATCH_SIZE = 16
+NUM_POINTS = 1024
+
+# Poses [B, K, ...] for B frames and their clouds [B, N, 3], metres.
+Predictor = Callable[[Sequence[Frame], np.ndarray], ArticulatedPose]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Estimates of F frames, in the order of the dataset.
+
+    Attributes:
+      names: F names.
+      estimate: arrays [F, K, ...]; NaN where ``failed``.
+      truth: arrays [F, K, ...].
+      failed: [F] bool: too few points, or an estimate that is not finite.
+      seconds_per_frame: time of the predictor alone, after a first call that compiles.
+    """
+
+    names: list[str]
+    estimate: ArticulatedPose
+    truth: ArticulatedPose
+    failed: np.ndarray
+    seconds_per_frame: float
+
+
+def evaluate(
+    dataset: Dataset,
+    predictor: Predictor,
+    limit: int | None = None,
+    batch_size: int = BATCH_SIZE,
+    num_points: int = NUM_POINTS,
+) -> Evaluation:
+    """Estimates every frame, in batches of one fixed shape so that nothing compiles twice.
+
+    Args:
+      dataset: labelled frames.
+      predictor: e.g. ``model_predictor(estimator)``.
+      limit: at most so many frames, from the first.
+      batch_size: frames per call; the last batch is filled up with copies.
+      num_points: points per cloud.
+
+    Raises:
+      CaperError: no frames, or frames without (or with broken) ground truth.
+    """
+    count = len(dataset) if limit is None else min(limit, len(dataset))
+    if count <= 0:
+        raise CaperError(f"nothing to evaluate: {len(dataset)} frames, limit {limit}")
+    names: list[str] = []
+    estimates: list[ArticulatedPose] = []
+    truths: list[ArticulatedPose] = []
+    seconds, warm = 0.0, False
+    with progress("evaluating", total=count) as bar:
+        for start in range(0, count, batch_size):
+            frames = [dataset[i] for i in range(start, min(start + batch_size, count))]
+            padded = frames + [frames[-1]] * (batch_size - len(frames))
+            clouds = np.stack([_cloud(frame, num_points) for frame in padded])
+            if not warm:
+                predictor(padded, clouds)
+                warm = True
+            began = time.perf_counter()
+            batch = jax.tree.map(np.asarray, predictor(padded, clouds))
+            seconds += time.perf_counter() - began
+            names += [frame.name for frame in frames]
+            truths += [_truth(frame, dataset.category) for frame in frames]
+            for i, frame in enumerate(frames):
+                pose = jax.tree.map(lambda array, i=i: array[i], batch)
+                estimates.append(_checked(pose, frame, dataset.category))
+            bar.update(len(frames))
+    estimate, truth = _stack(estimates), _stack(truths)
+    batches = -(-count // batch_size)
+    return Evaluation(
+        names=names,
+        estimate=estimate,
+        truth=truth,
+        failed=np.isnan(estimate.rotation).any((-1, -2, -3)),
+        seconds_per_frame=seconds / (batches * batch_size),
+    )
+
+
+def model_predictor(estimator: Callable[[np.ndarray], Any]) -> Predictor:
+    """The estimates of a trained model (``caper_jax.estimator.load``)."""
+
+    def predict(frames: Sequence[Frame], points: np.ndarray) -> ArticulatedPose:
+        return estimator(points).pose
+
+    return predict
+
+
+def truth_predictor(frames: Sequence[Frame], points: np.ndarray) -> ArticulatedPose:
+    """The dataset's own ground truth: whatever it does not score perfectly is our mistake."""
+    return _stack([frame.truth for frame in frames if frame.truth is not None])
+
+
+def mean_predictor(category: Category, mean_pose: Mapping[str, Any], source: str) -> Predictor:
+    """The trivial estimate that any model must beat: the mean of the training set, everywhere.
+
+    The root stands at the mean of the cloud plus a mean offset, with the mean rotation, sizes and
+    joints; the other parts follow by forward kinematics.
+
+    Args:
+      category: gives the shapes and the tree of parts.
+      mean_pose: "rotation" [3, 3] and "offset" [3] of the root (camera frame, metres from the mean
+        of the cloud), "size" and "box_center" [K, 3], "joint_axis" and "joint_pivot" [J, 3],
+        "joint_state" [J].
+      source: the file to name in errors.
+
+    Raises:
+      CaperError: a value is missing or has another shape.
+    """
+    shapes = pose_shapes(category.num_parts)
+    shapes.update(rotation=(3, 3), offset=(3,))
+    del shapes["translation"]
+    values = {}
+    for key, shape in shapes.items():
+        if key not in mean_pose:
+            raise CaperError(f"{source}: mean_pose lacks {key!r}")
+        values[key] = np.asarray(mean_pose[key], np.float32)
+        if values[key].shape != shape or not np.isfinite(values[key]).all():
+            raise CaperError(f"{source}: mean_pose {key} must be finite numbers {shape}")
+
+    def predict(frames: Sequence[Frame], points: np.ndarray) -> ArticulatedPose:
+        batch = len(points)
+        repeated = {key: np.repeat(value[None], batch, 0) for key, value in values.items()}
+        root = se3.from_rt(repeated["rotation"], points.mean(1) + repeated["offset"])
+        joints = (repeated["joint_axis"], repeated["joint_pivot"], repeated["joint_state"])
+        parts = forward_kinematics(root, *joints, category.joint_types, category.parents)
+        return ArticulatedPose(
+            rotation=parts[..., :3, :3],
+            translation=parts[..., :3, 3],
+            size=repeated["size"],
+            box_center=repeated["box_center"],
+            joint_axis=joints[0],
+            joint_pivot=joints[1],
+            joint_state=joints[2],
+        )
+
+    return predict
+
+
+def _cloud(frame: Frame, num_points: int) -> np.ndarray:
+    """[N, 3]; zeros for a frame that shows too little, whose estimate is not used."""
+    if len(frame.points) < MIN_POINTS:
+        return np.zeros((num_points, 3), np.float32)
+    return sample_points(frame.points, num_points, where=frame.name).points
+
+
+def _truth(frame: Frame, category: Category) -> ArticulatedPose:
+    if frame.truth is None:
+        raise CaperError(f"frame {frame.name!r} has no ground truth to evaluate against")
+    problems = pose_problems(frame.truth, category)
+    if problems:
+        raise CaperError(f"ground truth of frame {frame.name!r}: {'; '.join(problems)}")
+    return frame.truth
+
+
+def _checked(pose: ArticulatedPose, frame: Frame, category: Category) -> ArticulatedPose:
+    """The estimate, or NaN everywhere if it failed."""
+    finite = all(np.isfinite(array).all() for array in jax.tree.leaves(pose))
+    if finite and len(frame.points) >= MIN_POINTS:
+        return pose
+    shapes = pose_shapes(category.num_parts)
+    return ArticulatedPose(**{key: np.full(shape, np.nan) for key, shape in shapes.items()})
+
+
+def _stack(poses: Sequence[ArticulatedPose]) -> ArticulatedPose:
+    return jax.tree.map(lambda *arrays: np.stack(arrays), *poses)
