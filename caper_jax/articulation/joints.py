@@ -8,6 +8,7 @@ from jax.typing import ArrayLike
 
 from caper_jax.errors import unknown_name
 from caper_jax.geometry import se3, so3
+from caper_jax.geometry.linalg import as_floating, unit
 
 
 def revolute_transform(axis: ArrayLike, pivot: ArrayLike, angle: ArrayLike) -> jax.Array:
@@ -24,15 +25,15 @@ def revolute_transform(axis: ArrayLike, pivot: ArrayLike, angle: ArrayLike) -> j
     Returns:
       [..., 4, 4].
     """
-    u = unit_axis(axis)
-    q = so3.as_floating(pivot, (3,), "pivot")
-    w = u * so3.as_floating(angle, (), "angle")[..., None]
-    sine, cosine, _ = so3.exp_coefficients(w)
-    # (I - R) q = -(sin/t) w x q - ((1 - cos)/t^2) w x (w x q): small for small angles, where
-    # the difference q - R q would leave the rounding of q.
-    turned = jnp.cross(w, q)
-    shift = -sine[..., None] * turned - cosine[..., None] * jnp.cross(w, turned)
-    return se3.from_rt(so3.exp(w), shift)
+    u = unit(as_floating(axis, (3,), "axis"))
+    q = as_floating(pivot, (3,), "pivot")
+    angle = as_floating(angle, (), "angle")
+    sin, versine = jnp.sin(angle), 2 * jnp.sin(angle / 2) ** 2
+    # (I - R) q from the same terms: small for small angles, where the difference q - R q would
+    # be left with the rounding of q.
+    turned = jnp.cross(u, q)
+    shift = -sin[..., None] * turned - versine[..., None] * jnp.cross(u, turned)
+    return se3.from_rt(so3.rodrigues(u, sin, versine), shift)
 
 
 def prismatic_transform(axis: ArrayLike, displacement: ArrayLike) -> jax.Array:
@@ -45,8 +46,8 @@ def prismatic_transform(axis: ArrayLike, displacement: ArrayLike) -> jax.Array:
     Returns:
       [..., 4, 4].
     """
-    u = unit_axis(axis)
-    shift = u * so3.as_floating(displacement, (), "displacement")[..., None]
+    u = unit(as_floating(axis, (3,), "axis"))
+    shift = u * as_floating(displacement, (), "displacement")[..., None]
     return se3.from_rt(jnp.eye(3, dtype=shift.dtype), shift)
 
 
@@ -69,10 +70,3 @@ def joint_transform(
     if joint_type == "prismatic":
         return prismatic_transform(axis, state)
     raise unknown_name("joint type", joint_type, ("revolute", "prismatic"))
-
-
-def unit_axis(axis: ArrayLike) -> jax.Array:
-    """Axis [..., 3] scaled to unit length; the zero vector stays zero, with finite derivative."""
-    u = so3.as_floating(axis, (3,), "axis")
-    length = so3.norm(u)[..., None]
-    return u / jnp.where(length > 0, length, 1.0)

@@ -10,7 +10,8 @@ from jax.typing import ArrayLike
 
 from caper_jax.articulation.joints import joint_transform
 from caper_jax.errors import CaperError
-from caper_jax.geometry import se3, so3
+from caper_jax.geometry import se3
+from caper_jax.geometry.linalg import as_floating
 
 
 def forward_kinematics(
@@ -49,10 +50,10 @@ def forward_kinematics(
                 f"parents[{joint}] = {parent}: part {joint + 1} needs a parent among parts "
                 f"0 to {joint}"
             )
-    root = so3.as_floating(root, (4, 4), "root")
-    axis = so3.as_floating(axis, (joints, 3), "axis")
-    pivot = so3.as_floating(pivot, (joints, 3), "pivot")
-    state = so3.as_floating(state, (joints,), "state")
+    root = as_floating(root, (4, 4), "root")
+    axis = as_floating(axis, (joints, 3), "axis")
+    pivot = as_floating(pivot, (joints, 3), "pivot")
+    state = as_floating(state, (joints,), "state")
     poses = [root]
     for joint, (joint_type, parent) in enumerate(zip(joint_types, parents, strict=True)):
         motion = joint_transform(

@@ -14,12 +14,13 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from caper_jax.geometry import so3
+from caper_jax.geometry.linalg import apply, as_floating, multiply, norm, transpose
 
 
 def from_rt(rotation: ArrayLike, translation: ArrayLike) -> jax.Array:
     """Transform [..., 4, 4] ``p -> R p + t`` from R [..., 3, 3] and t [..., 3]."""
-    r = so3.as_floating(rotation, (3, 3), "rotation")
-    t = so3.as_floating(translation, (3,), "translation")
+    r = as_floating(rotation, (3, 3), "rotation")
+    t = as_floating(translation, (3,), "translation")
     batch = jnp.broadcast_shapes(r.shape[:-2], t.shape[:-1])
     dtype = jnp.result_type(r, t)
     top = jnp.concatenate(
@@ -42,26 +43,31 @@ def hat(xi: ArrayLike) -> jax.Array:
 
 def vee(matrix: ArrayLike) -> jax.Array:
     """Twist [..., 6] of ``hat``'s matrix [..., 4, 4]."""
-    matrix = so3.as_floating(matrix, (4, 4), "matrix")
+    matrix = as_floating(matrix, (4, 4), "matrix")
     return jnp.concatenate([so3.vee(matrix[..., :3, :3]), matrix[..., :3, 3]], axis=-1)
 
 
 def exp(xi: ArrayLike) -> jax.Array:
     """Transform [..., 4, 4] of a twist (w, rho) [..., 6]."""
     w, rho = _split(xi)
-    _, first, second = so3.exp_coefficients(w)
-    turned = jnp.cross(w, rho)
-    translation = rho + first[..., None] * turned + second[..., None] * jnp.cross(w, turned)
+    first, second, third = so3.exp_coefficients(so3.trigonometry(w))
+    along = jnp.sum(w * rho, axis=-1)
+    translation = (
+        first[..., None] * rho
+        + second[..., None] * jnp.cross(w, rho)
+        + (third * along)[..., None] * w
+    )
     return from_rt(so3.exp(w), translation)
 
 
 def log(transform: ArrayLike) -> jax.Array:
     """Twist (w, rho) [..., 6], |w| <= pi, of a transform [..., 4, 4]; see ``so3.log``."""
-    transform = so3.as_floating(transform, (4, 4), "transform")
+    transform = as_floating(transform, (4, 4), "transform")
     w, t = so3.log(transform[..., :3, :3]), transform[..., :3, 3]
-    turned = jnp.cross(w, t)
-    second = so3.inverse_jacobian_coefficient(w)[..., None]
-    return jnp.concatenate([w, t - turned / 2 + second * jnp.cross(w, turned)], axis=-1)
+    first, second = so3.inverse_coefficients(so3.trigonometry(w))
+    along = jnp.sum(w * t, axis=-1)
+    rho = first[..., None] * t - jnp.cross(w, t) / 2 + (second * along)[..., None] * w
+    return jnp.concatenate([w, rho], axis=-1)
 
 
 def left_jacobian(xi: ArrayLike) -> jax.Array:
@@ -78,20 +84,20 @@ def left_jacobian_inverse(xi: ArrayLike) -> jax.Array:
     """[..., 6, 6] inverse of ``left_jacobian``; singular at |w| = 2 pi, 4 pi, ... only."""
     w, rho = _split(xi)
     inverse = so3.left_jacobian_inverse(w)
-    block = so3.multiply(so3.multiply(inverse, _translation_block(w, rho)), inverse)
+    block = multiply(multiply(inverse, _translation_block(w, rho)), inverse)
     return _block_lower(inverse, -block)
 
 
 def compose(a: ArrayLike, b: ArrayLike) -> jax.Array:
     """Transform [..., 4, 4] that applies b first, then a."""
-    return so3.multiply(so3.as_floating(a, (4, 4), "a"), so3.as_floating(b, (4, 4), "b"))
+    return multiply(as_floating(a, (4, 4), "a"), as_floating(b, (4, 4), "b"))
 
 
 def inverse(transform: ArrayLike) -> jax.Array:
     """Inverse [..., 4, 4] of a rigid transform: ``[R^T | -R^T t]``."""
-    transform = so3.as_floating(transform, (4, 4), "transform")
-    back = so3.transpose(transform[..., :3, :3])
-    return from_rt(back, -so3.apply(back, transform[..., :3, 3]))
+    transform = as_floating(transform, (4, 4), "transform")
+    back = transpose(transform[..., :3, :3])
+    return from_rt(back, -apply(back, transform[..., :3, 3]))
 
 
 def act(transform: ArrayLike, points: ArrayLike) -> jax.Array:
@@ -101,16 +107,16 @@ def act(transform: ArrayLike, points: ArrayLike) -> jax.Array:
       transform: [..., 4, 4]; its batch axes broadcast against those before N.
       points: [..., N, 3] metres.
     """
-    transform = so3.as_floating(transform, (4, 4), "transform")[..., None, :3, :]
-    points = so3.as_floating(points, (3,), "points")
-    return so3.apply(transform[..., :3], points) + transform[..., 3]
+    transform = as_floating(transform, (4, 4), "transform")[..., None, :3, :]
+    points = as_floating(points, (3,), "points")
+    return apply(transform[..., :3], points) + transform[..., 3]
 
 
 def adjoint(transform: ArrayLike) -> jax.Array:
     """[..., 6, 6] Ad with ``T exp(xi) T^-1 = exp(Ad xi)``: ``[[R, 0], [hat(t) R, R]]``."""
-    transform = so3.as_floating(transform, (4, 4), "transform")
+    transform = as_floating(transform, (4, 4), "transform")
     rotation = transform[..., :3, :3]
-    return _block_lower(rotation, so3.multiply(so3.hat(transform[..., :3, 3]), rotation))
+    return _block_lower(rotation, multiply(so3.hat(transform[..., :3, 3]), rotation))
 
 
 def geodesic_distance(a: ArrayLike, b: ArrayLike) -> jax.Array:
@@ -119,7 +125,7 @@ def geodesic_distance(a: ArrayLike, b: ArrayLike) -> jax.Array:
     Errors are reported as rotation and translation apart (``so3.geodesic_distance``); this is the
     one number for optimisation and interpolation.
     """
-    return so3.norm(log(compose(inverse(a), b)))
+    return norm(log(compose(inverse(a), b)))
 
 
 def interpolate(a: ArrayLike, b: ArrayLike, fraction: ArrayLike) -> jax.Array:
@@ -135,7 +141,7 @@ def interpolate(a: ArrayLike, b: ArrayLike, fraction: ArrayLike) -> jax.Array:
 
 
 def _split(xi: ArrayLike) -> tuple[jax.Array, jax.Array]:
-    xi = so3.as_floating(xi, (6,), "xi")
+    xi = as_floating(xi, (6,), "xi")
     return xi[..., :3], xi[..., 3:]
 
 
@@ -147,24 +153,24 @@ def _block_lower(diagonal: jax.Array, lower: jax.Array) -> jax.Array:
 
 def _translation_block(w: jax.Array, rho: jax.Array) -> jax.Array:
     """Q(w, rho) [..., 3, 3]: how the translation of ``exp`` answers to a change of w."""
-    squared, small, t = so3.angle_terms(w)
-    sin, cos = jnp.sin(t), jnp.cos(t)
+    terms = so3.trigonometry(w)
+    small, _, t, squared, sin, cos = terms
+    cubic = so3.exp_coefficients(terms)[2]
     quartic = jnp.where(
         small,
-        so3.alternating_series(lambda k: 1 / math.factorial(2 * k + 4), squared),
-        (t**2 - 4 * jnp.sin(t / 2) ** 2) / (2 * t**4),
+        so3.alternating_series(lambda k: 1 / math.factorial(2 * k + 4), terms),
+        (squared - 2 * (1 - cos)) / (2 * squared**2),
     )
     quintic = jnp.where(
         small,
-        so3.alternating_series(lambda k: (k + 1) / math.factorial(2 * k + 5), squared),
-        (2 * t - 3 * sin + t * cos) / (2 * t**5),
+        so3.alternating_series(lambda k: (k + 1) / math.factorial(2 * k + 5), terms),
+        (2 * t - 3 * sin + t * cos) / (2 * squared**2 * t),
     )
-    cubic = so3.exp_coefficients(w)[2]
     a, b = so3.hat(w), so3.hat(rho)
-    ab, ba = so3.multiply(a, b), so3.multiply(b, a)
-    aba = so3.multiply(ab, a)
-    aab, baa = so3.multiply(a, ab), so3.multiply(ba, a)
-    abaa, aaba = so3.multiply(aba, a), so3.multiply(a, aba)
+    ab, ba = multiply(a, b), multiply(b, a)
+    aba = multiply(ab, a)
+    aab, baa = multiply(a, ab), multiply(ba, a)
+    abaa, aaba = multiply(aba, a), multiply(a, aba)
     return (
         b / 2
         + cubic[..., None, None] * (ab + ba + aba)

@@ -1,0 +1,61 @@
+"""Small vectors and matrices, batched over leading axes, multiplied element by element.
+
+On a CPU this is faster than batched 3 x 3 matmuls, and on a GPU it is exact where a matmul would
+round its float32 operands to TF32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from caper_jax.errors import CaperError
+
+
+def as_floating(value: ArrayLike, shape: Sequence[int], name: str) -> jax.Array:
+    """The value as a floating array whose trailing axes are ``shape``.
+
+    Raises:
+      CaperError: the trailing axes differ.
+    """
+    array = jnp.asarray(value)
+    if array.shape[max(array.ndim - len(shape), 0) :] != tuple(shape):
+        wanted = ", ".join(map(str, ("...", *shape)))
+        raise CaperError(f"{name} must have shape [{wanted}], got {list(array.shape)}")
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    return array.astype(jnp.result_type(float))
+
+
+def norm(vector: jax.Array) -> jax.Array:
+    """Euclidean length [...] of vectors [..., D], with derivative 0 at the zero vector."""
+    squared = jnp.sum(vector * vector, axis=-1)
+    zero = squared == 0.0
+    # Both branches of a `where` are differentiated, so sqrt must not see the zero.
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+
+
+def unit(vector: jax.Array) -> jax.Array:
+    """Vectors [..., D] scaled to length 1; the zero vector stays zero, with finite derivative."""
+    length = norm(vector)[..., None]
+    return vector / jnp.where(length > 0, length, 1.0)
+
+
+def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Matrix product of small matrices [..., I, K] and [..., K, J], element by element."""
+    terms = [a[..., :, k, None] * b[..., None, k, :] for k in range(a.shape[-1])]
+    return sum(terms[1:], start=terms[0])
+
+
+def apply(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    """Matrix-vector product of [..., I, K] and [..., K], element by element."""
+    terms = [matrix[..., :, k] * vector[..., k, None] for k in range(matrix.shape[-1])]
+    return sum(terms[1:], start=terms[0])
+
+
+def transpose(matrix: jax.Array) -> jax.Array:
+    """[..., I, J] -> [..., J, I]."""
+    return jnp.swapaxes(matrix, -1, -2)
