@@ -85,9 +85,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     _check_outputs(arguments)
     observation = _observe(arguments)
 
-    from caper_jax import estimator as estimators
+    from caper_jax.estimator import load
 
-    estimator = estimators.load(category.name, arguments.weights)
+    estimator = load(category.name, arguments.weights)
     prediction = estimator(observation.cloud.points[None])
     pose = _first(prediction.pose)
     confidence = np.asarray(prediction.confidence)[0]

@@ -17,8 +17,8 @@ PREDICTORS = ("model", "truth", "mean")
 def build_parser() -> argparse.ArgumentParser:
     parser = common.create_parser(
         "evaluate",
-        "Estimates every frame of a labelled dataset. Writes metrics.json (mean and median of every\n"
-        "error, failed frames included) and predictions.npz (every estimate) to a folder.",
+        "Estimates every frame of a labelled dataset and writes to a folder: metrics.json (mean\n"
+        "and median of every error, failed frames included) and predictions.npz (every estimate).",
         [
             ("--category box --data ReArtMix --format reartmix --out outputs/box", "real frames"),
             ("--category box --data box_test.h5 --format caper --out outputs/box", "generated"),
@@ -58,9 +58,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     weights = None
     predictor: protocol.Predictor = protocol.truth_predictor
     if arguments.predictor != "truth":
-        from caper_jax import estimator as estimators
+        from caper_jax.estimator import load
 
-        estimator = estimators.load(category.name, arguments.weights)
+        estimator = load(category.name, arguments.weights)
         weights = str(arguments.weights or f"shipped with the package ({category.name})")
         if arguments.predictor == "model":
             predictor = protocol.model_predictor(estimator)

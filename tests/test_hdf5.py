@@ -1,0 +1,213 @@
+"""The project's HDF5 format: what comes back, how precisely, and what is refused."""
+
+import dataclasses
+
+import h5py
+import numpy as np
+import pytest
+from frames import random_frames
+
+from caper_jax import categories
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.data import open_dataset
+from caper_jax.data.hdf5 import Hdf5Dataset, check_writable, write
+from caper_jax.data.schema import Frame, pose_shapes, validate
+from caper_jax.errors import CaperError
+
+BOX = categories.get("box")
+FRAMES, POINTS = 5, 300
+
+
+def write_box(path, **changes):
+    arguments = {"category": BOX, "split": "test", **random_frames(FRAMES, POINTS), **changes}
+    write(path, **arguments)
+    return arguments
+
+
+def test_everything_comes_back_to_a_hundredth_of_a_millimetre(tmp_path):
+    path = tmp_path / "box_test.h5"
+    written = write_box(path, attributes={"noise": "realsense", "seed": 7})
+    dataset = open_dataset("caper", path, "box", "test")
+    assert len(dataset) == FRAMES and dataset.category is BOX
+    assert (dataset.format, dataset.split, dataset.mask_source) == ("caper", "test", "simulated")
+    assert dataset.names == ["000000", "000001", "000002", "000003", "000004"]
+    assert dataset.attributes["noise"] == "realsense" and dataset.attributes["seed"] == 7
+    for i in range(FRAMES):
+        frame = dataset[i]
+        validate(frame, BOX)
+        assert np.abs(frame.points - written["points"][i]).max() < 1e-5
+        np.testing.assert_array_equal(frame.labels, written["labels"][i])
+        np.testing.assert_array_equal(frame.visible, written["visible"][i])
+        for key in pose_shapes(2):
+            expected = getattr(written["pose"], key)[i]
+            np.testing.assert_array_equal(getattr(frame.truth, key), expected)
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "box.h5"
+    with pytest.raises(TypeError):
+        write_box(path, attributes={"seed": object()})
+    assert list(tmp_path.iterdir()) == []
+    write_box(path)
+    before = path.read_bytes()
+    with pytest.raises(CaperError, match="exists already"):
+        write_box(path)
+    assert path.read_bytes() == before
+    write_box(path, split="train", overwrite=True)
+    assert Hdf5Dataset(path).split == "train"
+
+
+def test_unwritable_places_are_named_first(tmp_path):
+    with pytest.raises(CaperError, match="is a folder"):
+        check_writable(tmp_path)
+    with pytest.raises(CaperError, match="does not exist"):
+        check_writable(tmp_path / "absent" / "box.h5")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"points": np.zeros((FRAMES, POINTS, 2))}, r"points must be \[F, N, 3\]"),
+        ({"points": np.full((FRAMES, POINTS, 3), np.nan)}, "points_mean has NaN"),
+        ({"labels": np.full((FRAMES, POINTS), 2)}, r"labels must be -1 \(unknown\) to 1"),
+        ({"labels": np.zeros((FRAMES, POINTS - 1))}, "labels is int8"),
+        ({"visible": np.full((FRAMES, 2), -1)}, "visible must not be negative"),
+        ({"names": ["a"] * FRAMES}, "name has duplicates"),
+        ({"names": ["a"]}, "name is"),
+    ],
+)
+def test_arrays_against_the_conventions_are_not_written(tmp_path, changes, message):
+    with pytest.raises(CaperError, match=message):
+        write_box(tmp_path / "box.h5", **changes)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_file_must_say_about_itself(tmp_path):
+    path = tmp_path / "box.h5"
+    write_box(path)
+    with pytest.raises(CaperError, match="holds category 'box', not 'laptop'"):
+        Hdf5Dataset(path, "laptop")
+    with pytest.raises(CaperError, match="holds split 'test', not 'train'"):
+        Hdf5Dataset(path, "box", "train")
+    for key, value, message in (
+        ("format_version", 99, "version 99, this program reads"),
+        ("category", "bxo", "unknown category 'bxo'; did you mean 'box'"),
+    ):
+        write_box(path, overwrite=True)
+        with h5py.File(path, "r+") as file:
+            file.attrs[key] = value
+        with pytest.raises(CaperError, match=message):
+            Hdf5Dataset(path)
+    with h5py.File(path, "r+") as file:
+        del file.attrs["units"]
+    with pytest.raises(CaperError, match="lacks the attribute 'units'"):
+        Hdf5Dataset(path)
+
+
+@pytest.mark.parametrize("field", ["points", "rotation", "name"])
+def test_missing_and_misshapen_fields_are_named(tmp_path, field):
+    path = tmp_path / "box.h5"
+    write_box(path)
+    with h5py.File(path, "r+") as file:
+        shortened = file[field][:-1]
+        del file[field]
+        file[field] = shortened
+    with pytest.raises(CaperError, match=field if field != "points" else "points_mean"):
+        Hdf5Dataset(path)
+    with h5py.File(path, "r+") as file:
+        del file[field]
+    with pytest.raises(CaperError, match=f"lacks the field {field!r}"):
+        Hdf5Dataset(path)
+
+
+def test_damaged_files_are_named(tmp_path):
+    path = tmp_path / "box.h5"
+    with pytest.raises(CaperError, match="no such file"):
+        Hdf5Dataset(path)
+    write_box(path)
+    content = path.read_bytes()
+    for damaged in (content[: len(content) // 2], b"", b"not hdf5 at all" * 100):
+        path.write_bytes(damaged)
+        with pytest.raises(CaperError, match=r"box\.h5: truncated or not an HDF5 file"):
+            Hdf5Dataset(path)
+
+
+def test_objects_are_never_unpickled(tmp_path):
+    path = tmp_path / "box.h5"
+    write_box(path)
+    with h5py.File(path, "r+") as file:
+        del file["name"]
+        file.create_dataset("name", data=["a"] * FRAMES, dtype=h5py.string_dtype())
+    with pytest.raises(CaperError, match="field 'name' has type object"):
+        Hdf5Dataset(path)
+
+
+def test_unknown_format_names_the_nearest():
+    with pytest.raises(CaperError, match="unknown format 'reartmx'; did you mean 'reartmix'"):
+        open_dataset("reartmx", ".", "box")
+
+
+def good_frame():
+    arrays = random_frames(FRAMES, POINTS)
+    truth = ArticulatedPose(**{k: getattr(arrays["pose"], k)[0] for k in pose_shapes(2)})
+    labels = arrays["labels"][0].astype(np.int32)
+    return Frame("f", arrays["points"][0], labels, truth, arrays["visible"][0])
+
+
+def test_validate_names_every_problem_at_once():
+    frame = good_frame()
+    validate(frame, BOX)
+    bad = dataclasses.replace(
+        frame,
+        points=frame.points.astype(np.float64),
+        labels=np.full(POINTS, 5, np.int32),
+        visible=np.array([1, -1]),
+        truth=frame.truth.replace(size=-frame.truth.size, joint_axis=2 * frame.truth.joint_axis),
+    )
+    with pytest.raises(CaperError) as error:
+        validate(bad, BOX)
+    for phrase in (
+        "frame 'f' of box",
+        "points is float64",
+        "labels go from 5 to 5",
+        "visible must be counts",
+        "size must be positive at [0, 0]",
+        "joint_axis is not a unit vector",
+    ):
+        assert phrase in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.replace(rotation=1.1 * t.rotation), "rotation is not orthonormal.*its scale"),
+        (lambda t: t.replace(rotation=t.rotation * [1, 1, -1]), "rotation is a reflection"),
+        (lambda t: t.replace(joint_state=-t.joint_state), "pose of part 'lid' is not the one"),
+        (lambda t: t.replace(joint_state=np.degrees(t.joint_state)), "sign and unit"),
+        (lambda t: t.replace(translation=1000 * t.translation), "millimetres"),
+        (lambda t: t.replace(joint_pivot=t.joint_pivot + 0.02), "axis and pivot are in the root"),
+        (lambda t: t.replace(size=t.size[:1]), r"size has shape \(1, 3\), expected \(2, 3\)"),
+        (lambda t: t.replace(size=t.size.astype(int)), "expected a float array"),
+        (lambda t: t.replace(joint_pivot=t.joint_pivot * np.nan), r"joint_pivot has NaN.*\[0, 0\]"),
+    ],
+)
+def test_validate_understands_poses(change, message):
+    frame = good_frame()
+    with pytest.raises(CaperError, match=message):
+        validate(dataclasses.replace(frame, truth=change(frame.truth)), BOX)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"points": np.zeros((0, 3), np.float32)}, r"points has shape \(0, 3\)"),
+        ({"points": np.full((POINTS, 3), np.inf, np.float32)}, r"points has NaN.*at \[0, 0\]"),
+        ({"points": np.full((POINTS, 3), 800, np.float32)}, "are they in millimetres"),
+        ({"labels": np.zeros(3, np.int32)}, r"labels has shape \(3,\)"),
+        ({"labels": np.zeros(POINTS)}, "labels is float64, expected int32"),
+        ({"visible": np.zeros(3, int)}, r"visible has shape \(3,\)"),
+    ],
+)
+def test_validate_understands_clouds(changes, message):
+    with pytest.raises(CaperError, match=message):
+        validate(dataclasses.replace(good_frame(), **changes), BOX)
