@@ -85,7 +85,7 @@ def format_seconds(seconds: float) -> str:
 
 
 class _Lines:
-    """Plain lines: the first update, then one every ``interval`` seconds, then the end."""
+    """Plain lines: one at the start, one every ``interval`` seconds, one at the end."""
 
     def __init__(
         self,
@@ -100,14 +100,13 @@ class _Lines:
         self._interval, self._clock = interval, clock
         self._start = self._done = start
         self._began = clock()
-        self._printed_at: float | None = None
-        self._printed_done: int | None = None
         self._values: dict[str, float | str] = {}
+        self._print()
 
     def update(self, n: int = 1, **values: float | str) -> None:
         self._done += n
         self._values = values
-        if self._printed_at is None or self._clock() - self._printed_at >= self._interval:
+        if self._clock() - self._printed_at >= self._interval:
             self._print()
 
     def finish(self) -> None:

@@ -7,6 +7,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TypeVar
 
 from caper_jax.errors import CaperError
@@ -85,6 +86,21 @@ def create_parser(
         epilog="examples:\n" + "\n".join(lines) if lines else None,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def check_folder(folder: Path, argument: str) -> None:
+    """Refuses, before any work, a folder that cannot be made or written in.
+
+    Raises:
+      CaperError: a part of the path is a file, or there is no permission.
+    """
+    existing = folder
+    while not existing.exists():
+        existing = existing.parent
+    if not existing.is_dir():
+        raise CaperError(f"{argument} {folder}: {existing} is a file; give a folder")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise CaperError(f"{argument} {folder}: no permission to write in {existing}")
 
 
 def positive_int(text: str) -> int:

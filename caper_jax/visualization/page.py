@@ -31,6 +31,7 @@ from caper_jax.visualization.scene import (
     joint_segments,
     part_color,
 )
+from caper_jax.visualization.table import joint_errors, part_errors, scene_errors
 
 
 def write_page(path: str | Path, scenes: Sequence[Scene], title: str = "caper_jax") -> Path:
@@ -85,8 +86,13 @@ def _scene_data(scene: Scene) -> dict[str, Any]:
     order = np.argsort(scene.labels, kind="stable")
     points = np.asarray(scene.points)[order].astype("<f4")
     up = np.asarray(scene.pose.rotation)[0][:, "xyz".index(category.viewpoint.up)]
+    errors = scene_errors(scene)
     parts = [
-        {"name": name, "color": part_color(part), "errors": []}
+        {
+            "name": name,
+            "color": part_color(part),
+            "errors": {label: part_errors(error, part) for label, error in errors.items()},
+        }
         for part, name in enumerate(category.parts)
     ]
     joints = [
@@ -95,7 +101,9 @@ def _scene_data(scene: Scene) -> dict[str, Any]:
             "type": joint.type,
             "parent": joint.parent,
             "limits": _slider_limits(scene, index),
-            "errors": [],
+            "errors": {
+                label: joint_errors(error, index, joint.type) for label, error in errors.items()
+            },
         }
         for index, joint in enumerate(category.joints)
     ]

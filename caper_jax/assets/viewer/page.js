@@ -73,7 +73,11 @@ function fillJoints() {
     box.show = show;
     const known = [`estimate ${formatState(joint.type, scene.estimate.state[j])}`];
     if (scene.truth) known.push(`truth ${formatState(joint.type, scene.truth.state[j])}`);
-    box.append(row, slider, element("small", [joint.type, ...known, ...joint.errors].join(", ")));
+    box.append(row, slider, element("small", [joint.type, ...known].join(", ")));
+    for (const [label, [axis, pivot]] of Object.entries(joint.errors)) {
+      const texts = [`axis ${axis}`, ...(pivot === "-" ? [] : [`pivot ${pivot}`])];
+      box.append(element("small", `${label}: ${texts.join(", ")}`));
+    }
     return box;
   }));
   for (const box of place.children) box.show();
@@ -92,9 +96,9 @@ function fillParts() {
     row.append(name, element("td", formatSize(scene.estimate.size[k])));
     if (scene.truth) row.append(element("td", formatSize(scene.truth.size[k])));
     body.append(row);
-    if (part.errors.length) {
+    for (const [label, texts] of Object.entries(part.errors)) {
       const extra = element("tr", "");
-      extra.append(element("td", ""), element("td", part.errors.join(", "),
+      extra.append(element("td", ""), element("td", `${label}: ${texts.join(", ")}`,
         {colspan: "2", class: "note"}));
       body.append(extra);
     }

@@ -1,0 +1,176 @@
+"""``caper demo``: estimates on the real depth frames that ship with the package."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from importlib import resources
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from caper_jax.cli import common
+from caper_jax.errors import CaperError
+
+if TYPE_CHECKING:
+    from caper_jax.articulation.category import Category
+    from caper_jax.articulation.pose import ArticulatedPose
+    from caper_jax.visualization.scene import Scene
+
+TIMED_CALLS = 10  # per frame, after the first
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = common.create_parser(
+        "demo",
+        "Estimates the objects in the depth frames that ship with the package, compares them with\n"
+        "the ground truth, and draws them: a picture per category, and one page to turn in a\n"
+        "browser.",
+        [
+            ("", "all categories"),
+            ("--category box", "one category"),
+            ("--out /tmp/demo", "another folder than outputs/demo"),
+        ],
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("outputs/demo"), help="folder (default: %(default)s)"
+    )
+    parser.add_argument("--category", default="all", help="a category's name (default: all)")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
+    frames = _find_frames(arguments.category)
+    common.check_folder(arguments.out, "--out")
+
+    from caper_jax import categories
+    from caper_jax.visualization.page import write_page
+    from caper_jax.visualization.picture import write_picture
+
+    scenes: list[Scene] = []
+    written = []
+    for name, folders in frames.items():
+        category = categories.get(name)
+        own = _run_category(category, folders)
+        written.append(write_picture(arguments.out / f"{name}.png", own))
+        scenes += own
+    page = write_page(arguments.out / "index.html", scenes, "Estimated poses")
+    print("pictures:", ", ".join(str(path) for path in written))
+    print(f"page:     {page} (open it in a browser: turn the objects, move their joints)")
+    return 0
+
+
+def load_estimator(category: str) -> Callable[[np.ndarray], Any]:
+    """The estimator with the weights that ship with the package."""
+    from caper_jax import estimator
+
+    return estimator.load(category)
+
+
+def demo_folder() -> Path:
+    """Where the frames lie: ``<category>_<number>/`` with depth, mask, intrinsics and truth."""
+    return Path(str(resources.files("caper_jax"))) / "assets" / "demo"
+
+
+def _find_frames(category: str) -> dict[str, list[Path]]:
+    """Folders of the frames to run, by category.
+
+    Raises:
+      CaperError: a category without frames, or no frames at all.
+    """
+    found: dict[str, list[Path]] = {}
+    for folder in sorted(demo_folder().glob("*_*")):
+        found.setdefault(folder.name.rpartition("_")[0], []).append(folder)
+    if not found:
+        raise CaperError(f"no demo frames in {demo_folder()}; install the package again")
+    if category == "all":
+        return found
+    if category not in found:
+        raise CaperError(
+            f"--category {category}: there are demo frames of {', '.join(found)} (or: all)"
+        )
+    return {category: found[category]}
+
+
+def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
+    """Estimates the frames one by one, as a live camera would, and prints what it finds."""
+    from caper_jax.data.cloud import cloud_from_depth
+    from caper_jax.data.images import read_depth, read_intrinsics, read_mask
+    from caper_jax.progress import progress
+    from caper_jax.visualization.scene import Scene
+    from caper_jax.visualization.table import format_scene
+
+    scenes = []
+    first = 0.0
+    seconds: list[float] = []
+    calls = 1 + TIMED_CALLS * len(folders)
+    with progress(f"{category.name}: loading, compiling, estimating", total=calls) as bar:
+        estimator = load_estimator(category.name)
+        for folder in folders:
+            depth, mask = read_depth(folder / "depth.png"), read_mask(folder / "mask.png")
+            intrinsics = read_intrinsics(folder / "intrinsics.json", depth.shape)
+            points = cloud_from_depth(depth, mask, intrinsics).points
+            if not scenes:
+                first = _timed(estimator, points)[1]
+                bar.update(1)
+            for _ in range(TIMED_CALLS):
+                (pose, labels), spent = _timed(estimator, points)
+                seconds.append(spent)
+                bar.update(1)
+            truth = _read_truth(folder / "truth.json", category)
+            name = folder.name.replace("_", " ")
+            scenes.append(
+                Scene(name, category, points, labels, pose, truth, depth, mask, intrinsics)
+            )
+    for scene in scenes:
+        print(f"\n{scene.name}\n{format_scene(scene)}")
+    print(
+        f"\n{category.name}: {1000 * median(seconds):.1f} ms per frame (median of {len(seconds)}); "
+        f"first call, with compilation, {first:.1f} s\n"
+    )
+    return scenes
+
+
+def _timed(
+    estimator: Callable[[np.ndarray], Any], points: np.ndarray
+) -> tuple[tuple[ArticulatedPose, np.ndarray], float]:
+    """The estimate of one frame, pose and labels without batch axes, and its seconds."""
+    import jax
+
+    began = time.perf_counter()
+    prediction = estimator(points[None])
+    # Fetching the arrays waits for them: JAX returns before it has computed.
+    fetched = jax.device_get((prediction.pose, prediction.labels))
+    spent = time.perf_counter() - began
+    return jax.tree.map(lambda array: np.asarray(array)[0], fetched), spent
+
+
+def _read_truth(path: Path, category: Category) -> ArticulatedPose:
+    """Ground truth under the names of ``ArticulatedPose``; states in degrees or metres.
+
+    Raises:
+      CaperError: missing or broken file, or numbers that are no pose of this category.
+    """
+    from caper_jax.articulation.pose import ArticulatedPose
+    from caper_jax.data.images import read_json
+    from caper_jax.data.schema import pose_problems, pose_shapes
+
+    content = read_json(path)
+    try:
+        arrays = {key: np.asarray(content[key], float) for key in pose_shapes(category.num_parts)}
+        turning = np.array([kind == "revolute" for kind in category.joint_types], bool)
+        states = arrays["joint_state"]
+        arrays["joint_state"] = np.where(turning, np.radians(states), states)
+    except (KeyError, TypeError, ValueError) as error:
+        raise CaperError(f"{path}: no pose of {category.name} ({error})") from error
+    truth = ArticulatedPose(**arrays)
+    problems = pose_problems(truth, category)
+    if problems:
+        raise CaperError(f"{path}: {'; '.join(problems)}")
+    return truth

@@ -1,0 +1,254 @@
+"""Scenes, pictures, the page and tables."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from caper_jax.articulation.category import Category, Joint
+from caper_jax.articulation.kinematics import forward_kinematics
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.errors import CaperError
+from caper_jax.visualization import scene as scenes
+from caper_jax.visualization.page import write_page
+from caper_jax.visualization.picture import write_picture
+from caper_jax.visualization.scene import Scene
+from caper_jax.visualization.table import format_scene
+
+# A deep tree with both joint types: the third joint sits on the second link.
+ARM = Category(
+    name="arm",
+    parts=("base", "link", "slider"),
+    joints=(Joint("revolute", 0, (-2.0, 2.0)), Joint("prismatic", 1, (0.0, 0.2))),
+    directions=("x", "y"),
+    directions_reason="test",
+    unit=1.0,
+    mean_size=((0.1, 0.1, 0.1),) * 3,
+    mean_center=((0.0, 0.0, 0.0),) * 3,
+)
+ROOT = np.array(
+    [[0.6, 0.0, 0.8, 0.05], [0.64, -0.6, -0.48, -0.02], [0.48, 0.8, -0.36, 0.9], [0, 0, 0, 1.0]]
+)
+AXIS = np.array([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]])
+PIVOT = np.array([[0.02, 0.05, -0.03], [0.0, 0.0, 0.0]])
+STATE = np.array([0.7, 0.08])
+INTRINSICS = np.array([[300.0, 0.0, 100.0], [0.0, 310.0, 80.0], [0.0, 0.0, 1.0]])
+
+
+def part_poses(state: np.ndarray) -> np.ndarray:
+    with jax.enable_x64(True):
+        kinematics = forward_kinematics(ROOT, AXIS, PIVOT, state, ARM.joint_types, ARM.parents)
+        return np.asarray(kinematics)
+
+
+def arm_pose(state: np.ndarray = STATE) -> ArticulatedPose:
+    parts = part_poses(state)
+    size = np.array([[0.2, 0.06, 0.12], [0.1, 0.12, 0.05], [0.15, 0.04, 0.03]])
+    center = np.array([[0.0, 0.0, 0.0], [0.02, 0.1, 0.01], [0.1, 0.12, 0.0]])
+    return ArticulatedPose(
+        parts[:, :3, :3], parts[:, :3, 3], size, center, AXIS.copy(), PIVOT.copy(), state.copy()
+    )
+
+
+def arm_scene(**changes) -> Scene:
+    """Points on the corners and middles of the boxes, over a slanted background."""
+    pose = arm_pose()
+    corners = scenes.box_corners(pose)
+    points = np.concatenate([corners, (corners + corners.mean(1, keepdims=True)) / 2], axis=1)
+    labels = np.repeat(np.arange(3, dtype=np.int32), 16)
+    depth = np.linspace(0.7, 1.4, 160 * 200, dtype=np.float32).reshape(160, 200)
+    depth[:20] = 0
+    mask = np.zeros((160, 200), bool)
+    mask[60:120, 60:150] = True
+    scene = Scene(
+        "frame 1",
+        ARM,
+        points.reshape(-1, 3).astype(np.float32),
+        labels,
+        pose,
+        arm_pose(STATE + (0.05, 0.01)),
+        depth,
+        mask,
+        INTRINSICS,
+    )
+    return replace(scene, **changes)
+
+
+@pytest.fixture(scope="module")
+def page_text(tmp_path_factory: pytest.TempPathFactory) -> str:
+    name = 'a "frame" </script><b>'
+    path = tmp_path_factory.mktemp("page") / "new" / "index.html"
+    write_page(path, [arm_scene(name=name), arm_scene(truth=None)], "Title & <more>")
+    return path.read_text("utf-8")
+
+
+def read_png(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def page_data(text: str) -> dict:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    assert found
+    return json.loads(found.group(1))
+
+
+def test_projected_box_edges_are_those_of_the_solid():
+    pose = arm_pose()
+    pixels = scenes.project(scenes.box_corners(pose), INTRINSICS)
+    for part, matrix in enumerate(part_poses(STATE)):
+        edges = set()
+        for axis in range(3):  # four parallel edges along each axis of the box
+            for u in (-0.5, 0.5):
+                for v in (-0.5, 0.5):
+                    ends = []
+                    for w in (-0.5, 0.5):
+                        point = pose.box_center[part] + np.roll([w, u, v], axis) * pose.size[part]
+                        image = INTRINSICS @ (matrix @ [*point, 1.0])[:3]
+                        ends.append(tuple(np.round(image[:2] / image[2], 6)))
+                    edges.add(frozenset(ends))
+        drawn = {
+            frozenset(tuple(np.round(pixels[part, end], 6)) for end in edge)
+            for edge in scenes.BOX_EDGES
+        }
+        assert len(edges) == 12
+        assert drawn == edges
+
+
+def test_edges_at_the_farthest_corner_are_hidden():
+    corners = scenes.CORNER_SIGNS * (0.1, 0.2, 0.3)
+    hidden = scenes.hidden_edges(corners, eye=np.array([2.0, -1.5, 1.0]))
+    farthest = int(np.argmin(corners @ [2.0, -1.5, 1.0]))
+    assert hidden.tolist() == [farthest in edge for edge in scenes.BOX_EDGES]
+    assert not scenes.hidden_edges(corners, eye=np.array([0.0, 0.0, 5.0]))[
+        [index for index, (a, b) in enumerate(scenes.BOX_EDGES) if corners[[a, b], 2].min() > 0]
+    ].any()
+
+
+def test_joint_segments_are_the_lines_that_the_joint_leaves_in_place():
+    parts = part_poses(STATE)
+    segments = scenes.joint_segments(arm_pose(), ARM)
+    # Points of a revolute axis do not move when the child does.
+    relative = parts[1] @ np.linalg.inv(parts[0])
+    for end in segments[0]:
+        np.testing.assert_allclose((relative @ [*end, 1.0])[:3], end, atol=1e-12)
+    pivot = (parts[0] @ [*PIVOT[0], 1.0])[:3]
+    direction = np.diff(segments[0], axis=0)[0]
+    direction /= np.linalg.norm(direction)
+    np.testing.assert_allclose(np.cross(pivot - segments[0, 0], direction), 0, atol=1e-12)
+    np.testing.assert_allclose(direction, parts[0, :3, :3] @ AXIS[0], atol=1e-12)
+    # A prismatic axis points where a growing state moves the child: carried by the tilted link.
+    further = part_poses(STATE + (0.0, 0.1))[2, :3, 3] - parts[2, :3, 3]
+    slide = np.diff(segments[1], axis=0)[0]
+    np.testing.assert_allclose(slide / np.linalg.norm(slide), further / 0.1, atol=1e-9)
+
+
+def test_picture_shows_every_part_in_its_colour(tmp_path: Path):
+    path = write_picture(tmp_path / "new" / "picture.png", [arm_scene()])
+    pixels = read_png(path).reshape(-1, 3)
+    for part in range(3):
+        color = [int(scenes.part_color(part)[at : at + 2], 16) for at in (1, 3, 5)]
+        assert np.sum((pixels == color).all(-1)) > 50, ARM.parts[part]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"truth": None, "depth": None, "mask": None, "intrinsics": None},
+        {"mask": None},
+        {"pose": replace(arm_pose(), translation=arm_pose().translation - (0.0, 0.0, 1.2))},
+    ],
+    ids=["cloud only", "no mask", "estimate behind the camera"],
+)
+def test_picture_and_page_of_odd_scenes(tmp_path: Path, changes: dict):
+    scene = arm_scene(**changes)
+    assert read_png(write_picture(tmp_path / "a.png", [scene])).shape[1] > 1000
+    assert page_data(write_page(tmp_path / "a.html", [scene]).read_text("utf-8"))["scenes"]
+
+
+def test_page_loads_nothing_and_escapes_names(page_text: str):
+    assert not re.search("https?:", page_text)
+    code = re.sub(r'<script type="application/json".*?</script>', "", page_text, flags=re.S)
+    assert not re.search(r"//[a-z]|<link|@import|url\(|\bsrc=|fetch\(|\bimport\b", code)
+    assert page_text.count("</script>") == 2  # the data and the code
+    assert "<title>Title &amp; &lt;more&gt;</title>" in page_text
+    assert page_data(page_text)["scenes"][0]["name"] == 'a "frame" </script><b>'
+
+
+def test_page_holds_points_sorted_by_part(page_text: str):
+    first, second = page_data(page_text)["scenes"]
+    points = np.frombuffer(base64.b64decode(first["points"]), "<f4").reshape(-1, 3)
+    np.testing.assert_array_equal(points, arm_scene().points)  # already in order of part
+    assert first["counts"] == [16, 16, 16]
+    assert first["image"].startswith("data:image/png;base64,")
+    assert first["truth"] is not None
+    assert second["truth"] is None
+    low, high = first["joints"][1]["limits"]
+    assert low <= 0.08 <= 0.09 <= high
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs node to run the page's script")
+def test_sliders_of_the_page_follow_forward_kinematics(page_text: str, tmp_path: Path):
+    """The script moves boxes by joint changes; the oracle recomputes them from the new states."""
+    states = STATE + (-1.1, 0.05)
+    model = page_text.split("<script>")[1].split("// The camera, and")[0]
+    script = tmp_path / "run.js"
+    script.write_text(
+        f"{model}\nconst scene = {json.dumps(page_data(page_text)['scenes'][0])};\n"
+        f"const motions = partMotions(scene, {states.tolist()});\n"
+        "console.log(JSON.stringify(scene.estimate.corners.map("
+        "(corners, part) => corners.map((corner) => move(motions[part], corner)))));",
+        "utf-8",
+    )
+    done = subprocess.run(["node", str(script)], capture_output=True, text=True, check=True)
+    expected = scenes.box_corners(arm_pose(states))
+    np.testing.assert_allclose(json.loads(done.stdout), expected, atol=5e-6)
+
+
+def test_table_fits_80_columns_and_states_known_errors():
+    pose = arm_pose()
+    shifted = replace(pose, translation=pose.translation + (0.003, 0.0, 0.004))
+    lines = format_scene(arm_scene(pose=shifted, truth=pose)).splitlines()
+    assert max(map(len, lines)) <= 80
+    errors = [line.split() for line in lines if line.startswith("  error")]
+    assert errors[0][1:4] == ["5.0", "mm", "0.00°"]
+    assert errors[3] == ["error", "0.00°", "0.0", "mm", "0.00°"]
+    assert errors[4] == ["error", "0.00°", "-", "0.00", "cm"]
+    assert "error" not in format_scene(arm_scene(truth=None))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"points": np.full((48, 3), np.nan)}, "points must be finite"),
+        ({"labels": np.full(48, 3)}, "labels must be 0 to 2"),
+        ({"labels": np.zeros(5, int)}, "labels has shape"),
+        ({"pose": replace(arm_pose(), joint_state=np.array([np.nan, 0]))}, "pose.joint_state"),
+        ({"truth": replace(arm_pose(), size=np.zeros((2, 3)))}, "truth.size"),
+        ({"intrinsics": None}, "depth needs intrinsics"),
+        ({"mask": np.zeros((3, 3), bool)}, "mask is"),
+    ],
+)
+def test_scene_names_what_is_wrong(changes: dict, message: str):
+    with pytest.raises(CaperError, match=f"scene 'frame 1'.*{message}"):
+        arm_scene(**changes)
+
+
+def test_writing_needs_scenes_and_a_folder(tmp_path: Path):
+    with pytest.raises(CaperError, match="at least one scene"):
+        write_picture(tmp_path / "a.png", [])
+    with pytest.raises(CaperError, match="at least one scene"):
+        write_page(tmp_path / "a.html", [])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CaperError, match="cannot write"):
+        write_page(tmp_path / "file" / "a.html", [arm_scene(truth=None)])
