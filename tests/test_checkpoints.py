@@ -46,6 +46,19 @@ def saved(tmp_path) -> Path:
     return tmp_path / "c"
 
 
+def test_what_changes_after_save_is_not_in_the_checkpoint(tmp_path):
+    """Orbax writes in the background: a sum that grows meanwhile must not leak into the file."""
+    state, extra = make_state(1), {"sums": {"loss": 1.0}}
+    with Checkpoints(tmp_path) as checkpoints:
+        checkpoints.save(1, state, extra)
+        extra["sums"]["loss"] = 2.0
+        jax.jit(lambda s: jax.tree.map(lambda x: x * 0, s), donate_argnums=0)(state)
+    with Checkpoints(tmp_path) as checkpoints:
+        restored, extra = checkpoints.restore(make_state(0))
+    assert_same(restored, make_state(1))
+    assert extra == {"sums": {"loss": 1.0}}
+
+
 def largest_data_file(step: Path) -> Path:
     return max(step.glob("state/ocdbt.process_0/d/*"), key=lambda path: path.stat().st_size)
 
@@ -108,9 +121,12 @@ def test_training_goes_on_past_damaged_checkpoints_without_deleting_them(saved):
 
 
 def test_an_unfinished_write_is_ignored(saved):
+    """And its remains are cleared away, lest every kill cost disk space."""
     (saved / "9.orbax-checkpoint-tmp").mkdir()
     with Checkpoints(saved) as checkpoints:
         assert checkpoints.restore(make_state(0))[1]["step"] == 4
+        checkpoints.save(5, make_state(5))
+    assert sorted(p.name for p in saved.iterdir()) == ["3", "4", "5"]
 
 
 def test_if_nothing_can_be_read_all_are_named(saved):

@@ -7,6 +7,7 @@ step that reads back exactly as it was written, and says what it passed over.
 
 from __future__ import annotations
 
+import copy
 import gc
 import logging
 import sys
@@ -53,7 +54,9 @@ class Checkpoints:
         self.close()
 
     def _open(self) -> ocp.CheckpointManager:
-        options = ocp.CheckpointManagerOptions(max_to_keep=self._keep, create=True)
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=self._keep, create=True, cleanup_tmp_directories=True
+        )
         with _quiet():
             return ocp.CheckpointManager(
                 self.directory,
@@ -81,7 +84,8 @@ class Checkpoints:
           CaperError: it was not written (a failure of an earlier background write included).
         """
         self._move_unreadable_aside()
-        note = {"extra": extra or {}, "checksums": _checksums(state)}
+        # A snapshot, since Orbax writes it later and the caller's dict lives on.
+        note = copy.deepcopy({"extra": extra or {}, "checksums": _checksums(state)})
         arguments = ocp.args.Composite(
             state=ocp.args.StandardSave(state), note=ocp.args.JsonSave(note)
         )

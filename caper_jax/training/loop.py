@@ -90,6 +90,7 @@ class TrainingConfig:
                 raise CaperError(f"training.{name} must be positive, got {value}")
         if not 0 <= self.seed < 2**32:
             raise CaperError(f"training.seed must be in 0..2**32 - 1, got {self.seed}")
+        self.build_optimizer()  # checks its settings
 
     def build_optimizer(self) -> Optimizer:
         """The optimiser these settings describe."""
