@@ -1,0 +1,147 @@
+"""What a category is: its parts, joints, frames and symmetries, as data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from caper_jax.geometry.solids import Solid
+
+JointType = Literal["revolute", "prismatic"]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """The joint that carries one constrained part.
+
+    Attributes:
+      type: "revolute" or "prismatic".
+      parent: index of the part it is mounted on (0 is the root).
+      limits: (low, high) of the state used for training, radians or metres from the rest pose.
+    """
+
+    type: JointType
+    parent: int
+    limits: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Equivalence:
+    """A second, equally right reading of the same object (a declared ambiguity).
+
+    The pose of part k reads ``T'_k = T_permutation[k] @ S`` with S the rotation ``turn`` about the
+    canonical origin.
+
+    Attributes:
+      permutation: part k of the second reading is part ``permutation[k]`` of the first.
+      turn: [3, 3] rotation of the canonical frame.
+      reason: for people.
+    """
+
+    permutation: tuple[int, ...]
+    turn: tuple[tuple[float, float, float], ...]
+    reason: str
+
+
+@dataclass(frozen=True)
+class ObjectModel:
+    """One instance: solids per part at rest, and its joints.
+
+    Attributes:
+      parts: K lists of solids, in one common frame at rest; metres.
+      axis: [K-1, 3] unit joint axes in that frame; positive opens.
+      pivot: [K-1, 3] points on the axes.
+      limits: [K-1, 2] range of the states of this instance, radians or metres.
+    """
+
+    parts: list[list[Solid]]
+    axis: np.ndarray
+    pivot: np.ndarray
+    limits: np.ndarray
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """Where cameras of generated frames stand, relative to the object as in use.
+
+    Attributes:
+      up: the canonical axis that points away from the table, "y" for all but lying objects.
+      azimuth: degrees, full circle by default; 0 looks at the front (+z).
+      elevation: degrees above the table.
+      roll: degrees, symmetric about 0.
+      distance: in object diagonals.
+    """
+
+    up: Literal["x", "y", "z"] = "y"
+    azimuth: tuple[float, float] = (-180.0, 180.0)
+    elevation: tuple[float, float] = (5.0, 80.0)
+    roll: float = 15.0
+    distance: tuple[float, float] = (1.5, 6.0)
+
+
+@dataclass(frozen=True)
+class Category:
+    """A category of articulated objects (K parts, K - 1 joints), root first.
+
+    Attributes:
+      name: as on the command line.
+      parts: K names, in the order of every array.
+      joints: K - 1 joints; joint j carries part j + 1.
+      directions: the two axes of the root's frame that stage I regresses (paper Fig. 4).
+      directions_reason: why these two.
+      unit: network units per metre; inputs and outputs of the public interface are metres.
+      mean_size: [K, 3] metres, mean part sizes of the training instances (paper Sec 5.2.3).
+      mean_center: [K, 3] metres, mean box centres in the rest-canonical frame.
+      shape: draws an instance from a numpy generator; None when only real data exist.
+      viewpoint: cameras of generated frames.
+      equivalences: declared ambiguities.
+    """
+
+    name: str
+    parts: tuple[str, ...]
+    joints: tuple[Joint, ...]
+    directions: tuple[Literal["x", "y", "z"], Literal["x", "y", "z"]]
+    directions_reason: str
+    unit: float
+    mean_size: tuple[tuple[float, float, float], ...]
+    mean_center: tuple[tuple[float, float, float], ...]
+    shape: Callable[[np.random.Generator], ObjectModel] | None = None
+    viewpoint: Viewpoint = field(default_factory=Viewpoint)
+    equivalences: tuple[Equivalence, ...] = ()
+
+    @property
+    def num_parts(self) -> int:
+        return len(self.parts)
+
+    @property
+    def num_joints(self) -> int:
+        return len(self.joints)
+
+    @property
+    def joint_types(self) -> tuple[JointType, ...]:
+        return tuple(joint.type for joint in self.joints)
+
+    @property
+    def parents(self) -> tuple[int, ...]:
+        """[K-1] parent part of each joint."""
+        return tuple(joint.parent for joint in self.joints)
+
+    def __post_init__(self) -> None:
+        from caper_jax.errors import CaperError
+
+        where = f"category {self.name!r}"
+        if len(self.parts) != len(self.joints) + 1:
+            raise CaperError(f"{where}: {len(self.parts)} parts need {len(self.parts) - 1} joints")
+        for child, joint in enumerate(self.joints, start=1):
+            if not 0 <= joint.parent < child:
+                raise CaperError(f"{where}: part {child} must come after its parent {joint.parent}")
+            if not joint.limits[0] < joint.limits[1]:
+                raise CaperError(f"{where}: joint of part {child} has empty limits {joint.limits}")
+        if self.directions[0] == self.directions[1]:
+            raise CaperError(f"{where}: the two directions must differ, got {self.directions}")
+        for label, rows in (("mean_size", self.mean_size), ("mean_center", self.mean_center)):
+            if np.shape(rows) != (len(self.parts), 3):
+                raise CaperError(f"{where}: {label} must be [{len(self.parts)}, 3]")

@@ -1,0 +1,194 @@
+"""box: a tray (root) and a lid on a hinge along x; closed at rest, z to the front, y up."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caper_jax.articulation.category import Category, Equivalence, Joint, ObjectModel
+from caper_jax.geometry.solids import Solid, box, cylinder
+
+# Positive opens: the lid, in front of the hinge (+z), swings up (+y), which is about -x.
+_HINGE = np.array([[-1.0, 0.0, 0.0]])
+_TURN_X = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # cylinder z -> x
+
+
+def _pencil_case(rng: np.random.Generator) -> ObjectModel:
+    """Flat cases with the proportions of the eight measured ReArt-48 boxes.
+
+    Measured there, in mm: length 201-243, height 24-38, depth 74-94; lid 7-24 thick, as deep as
+    the base within 10 %; hinge 14-54 % of the height below the top and 2-10 % of the depth
+    inside the back.
+    """
+    scale = rng.uniform(0.72, 1.3)
+    length = scale * rng.uniform(0.19, 0.25)
+    height = scale * rng.uniform(0.022, 0.042)
+    depth = scale * rng.uniform(0.068, 0.105)
+    wall = scale * rng.uniform(0.002, 0.007)
+    lid_depth = depth * rng.uniform(0.9, 1.06)
+    lid_length = length * rng.uniform(0.95, 1.02)
+    on_top = rng.random() < 0.4
+    if on_top:  # a clamshell: the lid is a second, shallower tray
+        lid_thickness = height * rng.uniform(0.3, 0.8)
+        lid_bottom = height / 2
+        hinge_y = height / 2 - height * rng.uniform(-0.1, 0.35)
+    else:  # a lid let into the rim, or just over it
+        lid_thickness = height * rng.uniform(0.18, 0.55)
+        lid_bottom = height / 2 - lid_thickness + scale * rng.uniform(-0.006, 0.004)
+        lid_length = min(lid_length, length - 1.2 * wall) if lid_bottom < height / 2 else lid_length
+        hinge_y = height / 2 - height * rng.uniform(0.1, 0.45)
+    hinge_z = -depth / 2 + depth * rng.uniform(0.0, 0.1)
+
+    # Cavity, open at the top; an inlay may fill it almost to the rim.
+    floor = wall + (0.0 if rng.random() < 0.5 else rng.uniform(0.0, 0.55) * height)
+    base = [_tray((length, height, depth), wall, floor, upside_down=False)]
+    base += _contents(rng, (length, height, depth), wall, floor, lid_bottom)
+    if not on_top and rng.random() < 0.5:
+        # The back wall with the hinge stays as high as the rim.
+        base.append(
+            box(
+                (0, height / 2 - lid_thickness / 2, hinge_z - wall / 2),
+                (length * rng.uniform(0.2, 0.48), lid_thickness / 2, wall / 2),
+            )
+        )
+    lid_front = hinge_z + lid_depth
+    lid_center = (0.0, lid_bottom + lid_thickness / 2, (hinge_z + lid_front) / 2)
+    lid = [_lid_shell(rng, lid_center, (lid_length, lid_thickness, lid_depth), wall)]
+    if rng.random() < 0.5:
+        lid.append(_clasp(rng, lid_center, (lid_length, lid_thickness, lid_depth), height))
+    if rng.random() < 0.3:
+        radius = min(0.5 * lid_thickness, scale * 0.006)
+        half_length = length * rng.uniform(0.1, 0.45)
+        base.append(cylinder((0, hinge_y, hinge_z), (radius, radius, half_length), _TURN_X))
+    high = np.radians(rng.uniform(170, 200))
+    return _model(base, lid, (0.0, hinge_y, hinge_z), (np.radians(-3), high))
+
+
+def _chest(rng: np.random.Generator) -> ObjectModel:
+    """Deeper boxes: gift boxes, tool boxes and trunks, with plate, lipped or domed lids."""
+    length, depth = rng.uniform(0.1, 0.38), rng.uniform(0.08, 0.28)
+    height = rng.uniform(0.04, 0.22)
+    wall = rng.uniform(0.002, 0.009)
+    floor = wall + (0.0 if rng.random() < 0.6 else rng.uniform(0.0, 0.6) * height)
+    base = [_tray((length, height, depth), wall, floor, upside_down=False)]
+    base += _contents(rng, (length, height, depth), wall, floor, height / 2)
+    thickness = rng.uniform(0.003, 0.012)
+    hinge = (0.0, height / 2, -depth / 2)
+    style = rng.random()
+    if style < 0.4:  # plate
+        over = rng.uniform(-0.002, 0.012)
+        size = (length + 2 * over, thickness, depth + over)
+        lid = [box((0, height / 2 + thickness / 2, over / 2), np.array(size) / 2)]
+    elif style < 0.75:  # a lid with a rim around the base
+        rim = height * rng.uniform(0.1, 0.4)
+        size = (length + 2 * wall + 0.002, rim + thickness, depth + wall + 0.001)
+        center = (0, height / 2 + thickness - size[1] / 2, wall / 2)
+        cut = (length / 2 + 0.001, size[1] / 2, depth / 2 + 0.02)
+        hole = box((0, center[1] - thickness, -0.02 + 0.0005), cut)
+        lid = [box(center, np.array(size) / 2, hole=hole)]
+    else:  # a dome: half of an elliptic cylinder along x, hollow
+        rise = depth * rng.uniform(0.15, 0.5)
+        lid = [
+            cylinder(
+                (0, height / 2, 0),
+                (depth / 2, rise, length / 2),
+                _TURN_X,
+                hole=box((0, height / 2 - rise, 0), (length, rise, depth)),
+            )
+        ]
+    if rng.random() < 0.4:
+        lid.append(_clasp(rng, (0, height / 2, 0), (length, 2 * thickness, depth), height))
+    if rng.random() < 0.3:  # feet
+        foot = rng.uniform(0.004, 0.015)
+        for side_x in (-1, 1):
+            for side_z in (-1, 1):
+                place = (side_x * length * 0.4, -height / 2 - foot / 2, side_z * depth * 0.4)
+                base.append(box(place, (foot, foot / 2, foot)))
+    high = np.radians(rng.uniform(95, 185))
+    return _model(base, lid, hinge, (0.0, high))
+
+
+def _tray(size, wall: float, floor: float, upside_down: bool, center=(0.0, 0.0, 0.0)) -> Solid:
+    """An open box: full extents ``size``, walls and floor in metres."""
+    length, height, depth = size
+    sign = -1.0 if upside_down else 1.0
+    cavity = np.asarray(center, float) + (0, sign * floor, 0)
+    half = (length / 2 - wall, height / 2, depth / 2 - wall)
+    return box(center, np.array(size) / 2, hole=box(cavity, half))
+
+
+def _lid_shell(rng: np.random.Generator, center, size, wall: float) -> Solid:
+    """A plate, or a hollow shell when thick enough."""
+    if size[1] > 0.009 and rng.random() < 0.75:
+        floor = max(0.25 * size[1], 0.002)
+        return _tray(size, min(wall, 0.2 * size[1]) + 0.001, floor, True, center)
+    return box(center, np.array(size) / 2)
+
+
+def _contents(rng: np.random.Generator, size, wall: float, floor: float, top: float) -> list[Solid]:
+    """Dividers, pens and blocks in the tray, below ``top`` (y, metres)."""
+    length, height, depth = size
+    bottom = -height / 2 + floor
+    room = min(top, height / 2) - bottom
+    things: list[Solid] = []
+    if room < 0.006:
+        return things
+    for _ in range(rng.integers(0, 3)):
+        reach = 0.5 * room * rng.uniform(0.4, 0.95)
+        if rng.random() < 0.5:
+            place = (rng.uniform(-0.35, 0.35) * length, bottom + reach, 0)
+            things.append(box(place, (0.0012, reach, depth / 2 - wall)))
+        else:
+            place = (0, bottom + reach, rng.uniform(-0.3, 0.3) * depth)
+            things.append(box(place, (length / 2 - wall, reach, 0.0012)))
+    for _ in range(rng.integers(0, 3)):
+        half = 0.5 * room * rng.uniform(0.2, 0.9)
+        place = np.array(
+            [rng.uniform(-0.25, 0.25) * length, bottom + half, rng.uniform(-0.25, 0.25) * depth]
+        )
+        if rng.random() < 0.5:
+            half_x, half_z = rng.uniform(0.05, 0.2) * length, rng.uniform(0.05, 0.2) * depth
+            things.append(box(place, (half_x, half, half_z)))
+        else:
+            half_length = length * rng.uniform(0.1, 0.22)
+            things.append(cylinder(place, (half, half, half_length), _TURN_X))
+    return things
+
+
+def _clasp(rng: np.random.Generator, center, size, height: float) -> Solid:
+    """A tab at the front edge of the lid that hangs over the base's front wall."""
+    drop = min(0.5 * height, rng.uniform(0.006, 0.02))
+    place = (
+        rng.uniform(-0.2, 0.2) * size[0] * (rng.random() < 0.3),
+        center[1] + size[1] / 2 - drop / 2,
+        center[2] + size[2] / 2 + 0.0015,
+    )
+    return box(place, (size[0] * rng.uniform(0.03, 0.1), drop / 2, 0.0015))
+
+
+def _model(base: list[Solid], lid: list[Solid], hinge, limits) -> ObjectModel:
+    return ObjectModel([base, lid], _HINGE, np.array([hinge]), np.array([limits]))
+
+
+def shape(rng: np.random.Generator) -> ObjectModel:
+    """Draws one box: seven in ten are flat cases, the others deeper boxes and trunks."""
+    return _pencil_case(rng) if rng.random() < 0.7 else _chest(rng)
+
+
+BOX = Category(
+    name="box",
+    parts=("base", "lid"),
+    joints=(Joint("revolute", parent=0, limits=(np.radians(-3), np.radians(200))),),
+    directions=("x", "z"),
+    directions_reason="the hinge line and the way from hinge to front show at any opening angle",
+    unit=7.0,
+    mean_size=((0.23, 0.06, 0.11), (0.23, 0.025, 0.11)),
+    mean_center=((0.0, -0.005, 0.0), (0.0, 0.02, 0.0)),
+    shape=shape,
+    equivalences=(
+        Equivalence(
+            permutation=(1, 0),
+            turn=((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
+            reason="a case whose lid is as deep as its base may exchange the two",
+        ),
+    ),
+)

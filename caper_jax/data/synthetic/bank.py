@@ -1,0 +1,149 @@
+"""The instance bank: many procedural objects packed into fixed-size arrays for the ray caster."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import flax.struct
+import numpy as np
+
+from caper_jax.articulation.category import Category, ObjectModel
+from caper_jax.errors import CaperError
+from caper_jax.geometry.solids import Solid, bounds
+
+# Splits never share an instance: each draws from its own family of seeds.
+SPLITS = {"train": 0, "val": 1, "test": 2}
+
+
+@flax.struct.dataclass
+class SolidGroup:
+    """All solids of one kind pair (e.g. box minus cylinder); M slots per instance.
+
+    Attributes:
+      to_unit: [n, M, 3, 3] rest-canonical offsets -> unit solid.
+      center: [n, M, 3] metres.
+      half_axes: [n, M, 3, 3] columns are the solid's half axes (for its corners).
+      part: [n, M] int32.
+      valid: [n, M] bool; unused slots are False.
+      hole_to_unit, hole_center: the same for the solid cut away, or None.
+    """
+
+    to_unit: Any
+    center: Any
+    half_axes: Any
+    part: Any
+    valid: Any
+    hole_to_unit: Any = None
+    hole_center: Any = None
+
+
+@flax.struct.dataclass
+class Bank:
+    """n instances; leading axis n everywhere.
+
+    Attributes:
+      groups: {"box", "box-box", "cylinder", ...: SolidGroup}; the names are static.
+      joint_axis: [n, J, 3]; joint_pivot: [n, J, 3] metres, rest-canonical frame.
+      limits: [n, J, 2] radians or metres.
+      size: [n, K, 3]; box_center: [n, K, 3] metres, rest-canonical frame.
+    """
+
+    groups: dict[str, SolidGroup]
+    joint_axis: Any
+    joint_pivot: Any
+    limits: Any
+    size: Any
+    box_center: Any
+
+    @property
+    def num_instances(self) -> int:
+        return self.size.shape[0]
+
+
+def _group_name(solid: Solid) -> str:
+    return solid.kind if solid.hole is None else f"{solid.kind}-{solid.hole.kind}"
+
+
+def centered(model: ObjectModel) -> ObjectModel:
+    """The model with its origin at the centre of the whole object's box at rest."""
+    low, high = bounds([solid for part in model.parts for solid in part])
+    offset = -(low + high) / 2
+    parts = [[solid.moved(offset) for solid in part] for part in model.parts]
+    return ObjectModel(parts, model.axis, model.pivot + offset, model.limits)
+
+
+def draw_models(category: Category, count: int, split: str, seed: int) -> list[ObjectModel]:
+    """``count`` instances of a category; other splits and seeds give other instances.
+
+    Raises:
+      CaperError: unknown split, or a category without a procedural shape.
+    """
+    if split not in SPLITS:
+        raise CaperError(f"unknown split {split!r} (known: {', '.join(SPLITS)})")
+    if category.shape is None:
+        raise CaperError(f"category {category.name!r} has no procedural shape to generate from")
+    # The name enters the seed so that categories do not share their random streams.
+    root = [zlib.crc32(category.name.encode()), SPLITS[split], seed]
+    return [
+        centered(category.shape(np.random.default_rng([*root, index]))) for index in range(count)
+    ]
+
+
+def build_bank(models: list[ObjectModel]) -> Bank:
+    """Packs models (origins already centred) into one Bank of float32 numpy arrays."""
+    count = len(models)
+    solids = [
+        [(part, solid) for part, list_ in enumerate(model.parts) for solid in list_]
+        for model in models
+    ]
+    slots: dict[str, int] = {}
+    for rows in solids:
+        used: dict[str, int] = {}
+        for _, solid in rows:
+            name = _group_name(solid)
+            used[name] = used.get(name, 0) + 1
+        for name, number in used.items():
+            slots[name] = max(slots.get(name, 0), number)
+    groups = {name: _empty_group(name, count, slots[name]) for name in sorted(slots)}
+    for index, rows in enumerate(solids):
+        position = dict.fromkeys(slots, 0)
+        for part, solid in rows:
+            name = _group_name(solid)
+            _fill_slot(groups[name], index, position[name], part, solid)
+            position[name] += 1
+    boxes = np.array([[bounds(part) for part in model.parts] for model in models])
+    return Bank(
+        groups=groups,
+        joint_axis=np.array([model.axis for model in models], np.float32),
+        joint_pivot=np.array([model.pivot for model in models], np.float32),
+        limits=np.array([model.limits for model in models], np.float32),
+        size=(boxes[:, :, 1] - boxes[:, :, 0]).astype(np.float32),
+        box_center=((boxes[:, :, 1] + boxes[:, :, 0]) / 2).astype(np.float32),
+    )
+
+
+def _empty_group(name: str, count: int, slots: int) -> SolidGroup:
+    eye = np.tile(np.eye(3, dtype=np.float32), (count, slots, 1, 1))
+    zeros = np.zeros((count, slots, 3), np.float32)
+    hole = "-" in name
+    return SolidGroup(
+        to_unit=eye.copy(),
+        center=zeros.copy(),
+        half_axes=np.zeros_like(eye),
+        part=np.zeros((count, slots), np.int32),
+        valid=np.zeros((count, slots), bool),
+        hole_to_unit=eye.copy() if hole else None,
+        hole_center=zeros.copy() if hole else None,
+    )
+
+
+def _fill_slot(group: SolidGroup, index: int, slot: int, part: int, solid: Solid) -> None:
+    group.to_unit[index, slot] = solid.rotation.T / solid.half[:, None]
+    group.center[index, slot] = solid.center
+    group.half_axes[index, slot] = solid.rotation * solid.half
+    group.part[index, slot] = part
+    group.valid[index, slot] = True
+    if solid.hole is not None:
+        group.hole_to_unit[index, slot] = solid.hole.rotation.T / solid.hole.half[:, None]
+        group.hole_center[index, slot] = solid.hole.center

@@ -1,0 +1,142 @@
+"""The two networks of CAPER++: root pose (Sec 5.1) and constrained parts (Sec 5.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import flax.linen as nn
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from caper_jax.networks.fast_encoder import FastEncoder, FastEncoderConfig
+from caper_jax.networks.heads import HeadConfig, PointHead, PooledHead, unit_vectors
+from caper_jax.networks.hs_encoder import HSEncoder, HSEncoderConfig
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Both stages; the same sizes for each, separate weights.
+
+    Attributes:
+      encoder: which encoder; the sizes of the other one are not used.
+      hs: sizes of the HS-Encoder.
+      fast: sizes of the fast encoder.
+      root_heads: decoders of stage I.
+      pooled_heads: decoders of stage II with one output per cloud (state, sizes).
+      point_heads: decoders of stage II with one output per point (segmentation, joints).
+      num_points: points per cloud that the networks see.
+    """
+
+    encoder: Literal["hs", "fast"] = "fast"
+    hs: HSEncoderConfig = HSEncoderConfig()
+    fast: FastEncoderConfig = FastEncoderConfig()
+    root_heads: HeadConfig = HeadConfig()
+    pooled_heads: HeadConfig = HeadConfig()
+    point_heads: HeadConfig = HeadConfig()
+    num_points: int = 1024
+
+
+def make_encoder(config: NetworkConfig) -> nn.Module:
+    """The encoder that a config names: (points [B, N, 3], train) -> Features."""
+    if config.encoder == "hs":
+        return HSEncoder(config.hs, name="encoder")
+    return FastEncoder(config.fast, name="encoder")
+
+
+@flax.struct.dataclass
+class RootOutput:
+    """Stage I, in the frame and units of its input cloud.
+
+    Attributes:
+      directions: [B, 2, 3] unit vectors, two axes of the root's frame.
+      confidence: [B, 2] in (0, 1); the correction factors of Eq 3.
+      translation: [B, 3].
+    """
+
+    directions: Any
+    confidence: Any
+    translation: Any
+
+
+class RootNetwork(nn.Module):
+    """Stage I: two directions with confidence, and the translation as a residual to the mean."""
+
+    config: NetworkConfig
+
+    @nn.compact
+    def __call__(self, points, train: bool) -> RootOutput:
+        """points [B, N, 3], network units -> RootOutput."""
+        mean = points.mean(axis=1, keepdims=True)
+        features = make_encoder(self.config)(points - mean, train)
+        heads = self.config.root_heads
+        raw = jnp.stack(
+            [PooledHead(4, heads, name=f"direction{i}")(features, train) for i in range(2)], axis=1
+        )
+        residual = PooledHead(3, heads, with_points=True, name="translation")(features, train)
+        return RootOutput(
+            directions=unit_vectors(raw[..., 1:]),
+            confidence=jax.nn.sigmoid(raw[..., 0]),
+            translation=residual + mean[:, 0],
+        )
+
+
+@flax.struct.dataclass
+class PartsOutput:
+    """Stage II, in the root's canonical frame, network units; K parts, J = K - 1 joints.
+
+    Attributes:
+      segmentation: [B, N, K] logits.
+      heatmap: [B, N, J] in (0, 1), weight of each point's vote (Eq 5).
+      offset: [B, N, J, 3] from the point to its foot on the joint axis (Eq 4, as a vector).
+      direction: [B, N, J, 3] votes for the joint direction (Eq 7).
+      state: [B, J] radians, or network units for prismatic joints.
+      size: [B, K, 3] residual to the category's mean size.
+      center: [B, K, 3] residual to the category's mean box centre.
+    """
+
+    segmentation: Any
+    heatmap: Any
+    offset: Any
+    direction: Any
+    state: Any
+    size: Any
+    center: Any
+
+
+class PartsNetwork(nn.Module):
+    """Stage II: joint parameters by voting, joint states, part sizes and segmentation.
+
+    Attributes:
+      config: sizes.
+      num_parts: K.
+    """
+
+    config: NetworkConfig
+    num_parts: int
+
+    @nn.compact
+    def __call__(self, points, train: bool) -> PartsOutput:
+        """points [B, N, 3], canonicalised, network units -> PartsOutput."""
+        parts, joints = self.num_parts, self.num_parts - 1
+        batch, count = points.shape[:2]
+        # Not centred: where the origin lies is what stage I has found out.
+        features = make_encoder(self.config)(points, train)
+        pointwise = self.config.point_heads
+        segmentation = PointHead(parts, pointwise, name="segmentation")(features, train)
+        votes = PointHead(7 * joints, pointwise, name="joint")(features, train)
+        votes = votes.reshape(batch, count, joints, 7)
+        pooled = self.config.pooled_heads
+        state = PooledHead(joints, pooled, name="state")(features, train)
+        extent = PooledHead(6 * parts, pooled, name="size")(features, train)
+        extent = extent.reshape(batch, parts, 6)
+        return PartsOutput(
+            segmentation=segmentation,
+            heatmap=jax.nn.sigmoid(votes[..., 0]),
+            offset=votes[..., 1:4],
+            direction=votes[..., 4:],
+            state=state,
+            size=extent[..., :3],
+            center=extent[..., 3:],
+        )

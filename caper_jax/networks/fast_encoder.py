@@ -1,0 +1,111 @@
+"""The encoder of the `fast` preset: analytic local shape instead of searched neighbourhoods.
+
+A few centres take every point's weighted mean and covariance at several scales: local normal,
+curvature and density, by one exponential and one matrix product, with no neighbour search and no
+gather. Residual layers then mix each centre with the maximum and mean over all of them. What it
+keeps of the HS-Encoder: hybrid scopes (several receptive fields per centre), global features in
+every layer, and the interface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import flax.linen as nn
+import jax.numpy as jnp
+
+from caper_jax.networks.features import Features, Level
+from caper_jax.networks.graph import nearest, squared_distances
+
+
+@dataclass(frozen=True)
+class FastEncoderConfig:
+    """Sizes of the fast encoder.
+
+    Attributes:
+      centers: points that get local moments; every (N / centers)-th of the cloud.
+      stride: the moments are taken over every stride-th point.
+      scales: standard deviations of the Gaussian windows, relative to the cloud's radius.
+      width: features per centre.
+      blocks: residual layers, each with a global feature.
+      last: channels of the last layer.
+      global_feature: append the maximum of the last layer to every point's feature.
+    """
+
+    centers: int = 128
+    stride: int = 2
+    scales: tuple[float, ...] = (0.1, 0.2, 0.4)
+    width: int = 128
+    blocks: int = 2
+    last: int = 384
+    global_feature: bool = True
+
+
+def local_moments(centers, points, scale):
+    """Weighted mean, covariance and density of the points around each centre.
+
+    Args:
+      centers: [B, M, 3].
+      points: [B, N, 3].
+      scale: [B] standard deviation of the Gaussian window, same unit.
+
+    Returns:
+      [B, M, 11]: covariance over its trace (6), mean offset (3) and radius (1) in windows, share
+      of all points (1). All are independent of the unit.
+    """
+    scale = scale[:, None, None]
+    weight = jnp.exp(-0.5 * squared_distances(centers, points) / (scale * scale))
+    x, y, z = (points[..., i : i + 1] for i in range(3))
+    products = jnp.concatenate([points, x * x, y * y, z * z, x * y, x * z, y * z], -1)
+    total = weight.sum(-1, keepdims=True) + 1e-6
+    moment = jnp.einsum("bmn,bnc->bmc", weight, products, precision="highest") / total
+    mean = moment[..., :3]
+    x, y, z = (mean[..., i : i + 1] for i in range(3))
+    outer = jnp.concatenate([x * x, y * y, z * z, x * y, x * z, y * z], -1)
+    covariance = moment[..., 3:] - outer
+    trace = jnp.maximum(covariance[..., :3].sum(-1, keepdims=True), 0.0) + 1e-8
+    return jnp.concatenate(
+        [
+            3.0 * covariance / trace,
+            (mean - centers) / scale,
+            jnp.sqrt(trace) / scale,
+            10.0 * total / points.shape[1],
+        ],
+        -1,
+    )
+
+
+class FastEncoder(nn.Module):
+    """Local moments at centres, then residual layers with global features.
+
+    Attributes:
+      config: sizes.
+    """
+
+    config: FastEncoderConfig = FastEncoderConfig()
+
+    @nn.compact
+    def __call__(self, points, train: bool) -> Features:
+        """points [B, N, 3], network units -> Features at ``centers`` points."""
+        config = self.config
+
+        def norm_relu(features):
+            return nn.relu(nn.BatchNorm(use_running_average=not train, momentum=0.9)(features))
+
+        centers = points[:, :: max(1, points.shape[1] // config.centers)][:, : config.centers]
+        middle = points.mean(axis=1, keepdims=True)
+        radius = jnp.sqrt(((points - middle) ** 2).sum(-1).mean(-1) + 1e-8)
+        window = points[:, :: config.stride]
+        local = [local_moments(centers, window, radius * scale) for scale in config.scales]
+        relative = (centers - middle) / radius[:, None, None]
+        features = jnp.concatenate([*local, centers, relative], -1)
+        features = norm_relu(nn.Dense(config.width)(features))
+        features = norm_relu(nn.Dense(config.width)(features))
+        for _ in range(config.blocks):
+            shared = jnp.concatenate([features.max(axis=1), features.mean(axis=1)], -1)
+            mixed = nn.Dense(config.width)(features)
+            mixed += nn.Dense(config.width, use_bias=False)(shared)[:, None, :]
+            features += norm_relu(mixed)
+        last = norm_relu(nn.Dense(config.last)(features))
+        level = Level(last, nearest(points, centers, 1)[..., 0])
+        return Features(points, (level,), last.max(axis=1) if config.global_feature else None)

@@ -1,0 +1,70 @@
+"""What an encoder hands to the heads: features at several resolutions, never up-sampled early."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import flax.struct
+
+from caper_jax.networks.graph import gather
+
+
+@flax.struct.dataclass
+class Level:
+    """Features of a subset of the points.
+
+    Attributes:
+      features: [B, M, C].
+      nearest: [B, N] row of ``features`` nearest to each input point; None when M == N and the
+        rows are the points themselves.
+    """
+
+    features: Any
+    nearest: Any = None
+
+
+@flax.struct.dataclass
+class Features:
+    """Encoder output.
+
+    Attributes:
+      points: [B, N, 3] the centred input cloud.
+      levels: fine to coarse.
+      shared: [B, G] global feature, or None.
+    """
+
+    points: Any
+    levels: tuple[Level, ...]
+    shared: Any = None
+
+
+class BlockDense(nn.Module):
+    """A dense layer over the concatenation of all levels at every point, without building it.
+
+    Each level is projected at its own resolution and the sums are up-sampled: the same result as
+    concatenating first (paper Sec 5.1.1), for a fraction of the arithmetic.
+
+    Attributes:
+      width: output channels.
+      with_points: whether the centred coordinates are part of the concatenation (the translation
+        and joint heads of the paper).
+    """
+
+    width: int
+    with_points: bool = False
+
+    @nn.compact
+    def __call__(self, features: Features):
+        """Features -> [B, N, width]."""
+        total = 0.0
+        for number, level in enumerate(features.levels):
+            bias = number == 0
+            part = nn.Dense(self.width, use_bias=bias, name=f"level{number}")(level.features)
+            total += part if level.nearest is None else gather(part, level.nearest)
+        if self.with_points:
+            total += nn.Dense(self.width, use_bias=False, name="points")(features.points)
+        if features.shared is not None:
+            shared = nn.Dense(self.width, use_bias=False, name="shared")(features.shared)
+            total += shared[:, None, :]
+        return total

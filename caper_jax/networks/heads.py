@@ -1,0 +1,88 @@
+"""Decoders on top of an encoder: pooled (one output per cloud) and point-wise (Sec 5.1-5.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import flax.linen as nn
+import jax.numpy as jnp
+
+from caper_jax.networks.features import BlockDense, Features
+
+
+@dataclass(frozen=True)
+class HeadConfig:
+    """Sizes of every decoder.
+
+    Attributes:
+      widths: channels of the first, second and (after pooling) third layer.
+      dropout: rate before the last layer, in training.
+      coarse: pool over the coarsest level only instead of over every point. The maximum over
+        points of up-sampled coarse features is the maximum over coarse features, so little is
+        lost where the coarse level carries nearly everything.
+    """
+
+    widths: tuple[int, int, int] = (1024, 256, 256)
+    dropout: float = 0.2
+    coarse: bool = False
+
+
+def _norm_relu(features, train: bool):
+    return nn.relu(nn.BatchNorm(use_running_average=not train, momentum=0.9)(features))
+
+
+class PooledHead(nn.Module):
+    """Two point-wise layers, maximum over points, two more layers.
+
+    Attributes:
+      outputs: numbers per cloud.
+      config: sizes.
+      with_points: concatenates the centred coordinates to the features.
+    """
+
+    outputs: int
+    config: HeadConfig
+    with_points: bool = False
+
+    @nn.compact
+    def __call__(self, features: Features, train: bool):
+        """Features -> [B, outputs]."""
+        first, second, third = self.config.widths
+        if self.config.coarse:
+            hidden = nn.Dense(first)(features.levels[-1].features)
+            if features.shared is not None:
+                hidden += nn.Dense(first, use_bias=False)(features.shared)[:, None, :]
+        else:
+            hidden = BlockDense(first, self.with_points)(features)
+        hidden = _norm_relu(hidden, train)
+        hidden = _norm_relu(nn.Dense(second)(hidden), train).max(axis=1)
+        hidden = _norm_relu(nn.Dense(third)(hidden), train)
+        hidden = nn.Dropout(self.config.dropout, deterministic=not train)(hidden)
+        return nn.Dense(self.outputs)(hidden)
+
+
+class PointHead(nn.Module):
+    """Two point-wise layers and an output per point.
+
+    Attributes:
+      outputs: numbers per point.
+      config: sizes.
+    """
+
+    outputs: int
+    config: HeadConfig
+
+    @nn.compact
+    def __call__(self, features: Features, train: bool):
+        """Features -> [B, N, outputs]."""
+        first, second, _ = self.config.widths
+        hidden = _norm_relu(BlockDense(first, with_points=True)(features), train)
+        hidden = _norm_relu(nn.Dense(second)(hidden), train)
+        hidden = nn.Dropout(self.config.dropout, deterministic=not train)(hidden)
+        return nn.Dense(self.outputs)(hidden)
+
+
+def unit_vectors(raw):
+    """[..., 3] -> unit vectors; the slope stays finite at zero, where the result is zero."""
+    squared = (raw * raw).sum(-1, keepdims=True)
+    return raw / jnp.sqrt(squared + 1e-12)

@@ -1,0 +1,179 @@
+"""The HS-Encoder: hybrid-scope graph convolutions (paper Sec 5.1.1; HS-Pose, CVPR 2023)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from caper_jax.networks.features import Features, Level
+from caper_jax.networks.graph import (
+    directional_max,
+    directions,
+    gather,
+    nearest,
+    neighbour_max,
+)
+
+
+@dataclass(frozen=True)
+class HSEncoderConfig:
+    """Sizes of the HS-Encoder.
+
+    Attributes:
+      channels: of the surface layer and the four HS layers.
+      neighbours: k at full resolution; at most an eighth of the points after pooling.
+      supports: directions per kernel.
+      pooling: factor between resolutions.
+      feature_space: receptive fields by distance in feature space (RF-F); otherwise every layer
+        shares the neighbours in space.
+      global_feature: append the maximum of the last layer to every point's feature.
+    """
+
+    channels: tuple[int, int, int, int, int] = (128, 128, 256, 256, 512)
+    neighbours: int = 20
+    supports: int = 7
+    pooling: int = 4
+    feature_space: bool = True
+    global_feature: bool = True
+
+
+def _uniform(bound: float):
+    def init(key, shape, dtype=jnp.float32):
+        return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+    return init
+
+
+class OutlierRobust(nn.Module):
+    """ORL: adds a global feature that single outliers do not move.
+
+    Maximum over each point's neighbours in space, mean over all points, then a linear map of
+    [feature, global] added to the feature.
+    """
+
+    @nn.compact
+    def __call__(self, features, around):
+        """features [B, N, C], around [B, N, k] neighbours in space -> [B, N, C]."""
+        channels = features.shape[-1]
+        shared = neighbour_max(features, around).mean(1, keepdims=True)
+        own = nn.Dense(channels, use_bias=False, name="own")(features)
+        return features + own + nn.Dense(channels, use_bias=False, name="shared")(shared)
+
+
+class HSLayer(nn.Module):
+    """One hybrid-scope layer; the surface layer when it gets no features.
+
+    Attributes:
+      channels: output channels C.
+      supports: s support directions.
+    """
+
+    channels: int
+    supports: int
+
+    @nn.compact
+    def __call__(self, points, features, scope, around):
+        """Convolves over ``scope`` and makes the result robust over ``around``.
+
+        Args:
+          points: [B, N, 3].
+          features: [B, N, C_in], or None for the surface layer.
+          scope: [B, N, k] receptive field (neighbours in feature space, or in space).
+          around: [B, N, k'] neighbours in space.
+
+        Returns:
+          [B, N, C].
+        """
+        width = self.supports * self.channels
+        scale = width if features is None else self.channels * (self.supports + 1)
+        bound = scale**-0.5
+        weights = self.param("directions", _uniform(bound), (3, width))
+        weights = weights / jnp.maximum(jnp.linalg.norm(weights, axis=0), 1e-12)
+        toward = directions(points, scope)
+        if features is None:
+            skip = nn.Dense(self.channels, use_bias=False, name="skip")(points)
+            center = 0.0
+            active = directional_max(toward, scope, None, weights)
+        else:
+            skip = nn.Dense(self.channels, use_bias=False, name="skip")(features)
+            kernel = _uniform(bound)
+            dense = nn.Dense(
+                width + self.channels, kernel_init=kernel, bias_init=kernel, name="support"
+            )(features)
+            center, support = dense[..., : self.channels], dense[..., self.channels :]
+            active = directional_max(toward, scope, support, weights)
+        active = active.reshape(*active.shape[:2], self.supports, self.channels).mean(2)
+        return OutlierRobust(name="robust")(center + active, around) + skip
+
+
+class HSEncoder(nn.Module):
+    """Surface layer and four HS layers with two poolings (architecture of HS-Pose).
+
+    Attributes:
+      config: sizes.
+    """
+
+    config: HSEncoderConfig = HSEncoderConfig()
+
+    @nn.compact
+    def __call__(self, points, train: bool) -> Features:
+        """points [B, N, 3], centred, network units -> Features at N, N/4 and N/16 points.
+
+        In training the pooled subset is drawn from the rng stream "sample", per cloud; in
+        evaluation it is every fourth point.
+        """
+        config = self.config
+        layer = [
+            HSLayer(channels, config.supports, name=f"layer{number}")
+            for number, channels in enumerate(config.channels)
+        ]
+
+        def normalise(features, number):
+            norm = nn.BatchNorm(use_running_average=not train, momentum=0.9, name=f"norm{number}")
+            return nn.relu(norm(features))
+
+        def scope(features, around, k):
+            if not config.feature_space:
+                return around
+            return nearest(features, features, k, exclude_self=True)
+
+        k0 = self._neighbours(points.shape[1])
+        around0 = nearest(points, points, k0, exclude_self=True)
+        f0 = nn.relu(layer[0](points, None, around0, around0))
+        f1 = normalise(layer[1](points, f0, scope(f0, around0, k0), around0), 1)
+
+        points1, f1_pooled = self._pool(points, f1, around0, train)
+        k1 = self._neighbours(points1.shape[1])
+        around1 = nearest(points1, points1, k1, exclude_self=True)
+        f2 = normalise(layer[2](points1, f1_pooled, scope(f1_pooled, around1, k1), around1), 2)
+        f3 = normalise(layer[3](points1, f2, scope(f2, around1, k1), around1), 3)
+
+        points2, f3_pooled = self._pool(points1, f3, around1, train)
+        k2 = self._neighbours(points2.shape[1])
+        around2 = nearest(points2, points2, k2, exclude_self=True)
+        f4 = layer[4](points2, f3_pooled, scope(f3_pooled, around2, k2), around2)
+
+        levels = (
+            Level(jnp.concatenate([f0, f1], -1)),
+            Level(jnp.concatenate([f2, f3], -1), nearest(points, points1, 1)[..., 0]),
+            Level(f4, nearest(points, points2, 1)[..., 0]),
+        )
+        return Features(points, levels, f4.max(1) if config.global_feature else None)
+
+    def _neighbours(self, count: int) -> int:
+        return max(1, min(self.config.neighbours, count // 8))
+
+    def _pool(self, points, features, around, train: bool):
+        """Maximum over the four nearest neighbours, on a quarter of the points."""
+        batch, count = points.shape[:2]
+        kept = count // self.config.pooling
+        if train:
+            keys = jax.random.split(self.make_rng("sample"), batch)
+            chosen = jax.vmap(lambda key: jax.random.permutation(key, count)[:kept])(keys)
+        else:
+            chosen = jnp.broadcast_to(jnp.arange(kept) * self.config.pooling, (batch, kept))
+        pooled = neighbour_max(features, gather(around[..., :4], chosen))
+        return gather(points, chosen), pooled

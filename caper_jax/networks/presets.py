@@ -1,0 +1,28 @@
+"""The two presets: `paper` as published, `fast` for CPUs."""
+
+from __future__ import annotations
+
+from caper_jax.errors import unknown_name
+from caper_jax.networks.caper import NetworkConfig
+from caper_jax.networks.heads import HeadConfig
+
+PRESETS: dict[str, NetworkConfig] = {
+    "paper": NetworkConfig(encoder="hs"),
+    "fast": NetworkConfig(
+        encoder="fast",
+        root_heads=HeadConfig(widths=(256, 256, 256), dropout=0.0, coarse=True),
+        pooled_heads=HeadConfig(widths=(256, 256, 256), dropout=0.0, coarse=True),
+        point_heads=HeadConfig(widths=(64, 64, 64), dropout=0.0),
+    ),
+}
+
+
+def preset(name: str) -> NetworkConfig:
+    """The network sizes of a preset.
+
+    Raises:
+      CaperError: unknown name.
+    """
+    if name not in PRESETS:
+        raise unknown_name("preset", name, PRESETS)
+    return PRESETS[name]

@@ -1,0 +1,226 @@
+"""Training both stages on generated batches: targets, noise of the root pose, total loss."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from caper_jax.geometry.directions import rotation_from_directions
+
+from caper_jax.articulation.category import Category
+from caper_jax.articulation.equivalence import is_ambiguous, second_labels, second_reading
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.geometry import so3
+from caper_jax.networks.canonical import canonicalise, multiply, rotate, view_rotation
+from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
+from caper_jax.networks.voting import vote
+from caper_jax.training import losses
+from caper_jax.training.losses import HeatmapKind, LossWeights
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """What the loss depends on besides the network.
+
+    Attributes:
+      weights: of Eqs 22 and 23.
+      heatmap: form of Eq 5: "exponential" (as printed), "scaled" or "linear".
+      state_penalty: alpha of Eq 20.
+      root_noise_deg: stage II sees clouds canonicalised with a root pose that is off by a rotation
+        with this standard deviation about each axis...
+      root_noise: ... and a translation with this standard deviation, in network units.
+      predicted_root: fraction of samples canonicalised with stage I's own (detached) prediction,
+        where that is within 25 deg of the truth.
+    """
+
+    weights: LossWeights = LossWeights()
+    heatmap: HeatmapKind = "exponential"
+    state_penalty: float = 20.0
+    root_noise_deg: float = 4.0
+    root_noise: float = 0.03
+    predicted_root: float = 0.5
+
+
+class Task:
+    """Networks of one category with their loss; the training loop sees only ``loss``.
+
+    Attributes:
+      category: what is estimated.
+      network: sizes of both networks.
+      config: the loss.
+    """
+
+    def __init__(self, category: Category, network: NetworkConfig, config: LossConfig) -> None:
+        self.category = category
+        self.network = network
+        self.config = config
+        self.root = RootNetwork(network)
+        self.parts = PartsNetwork(network, category.num_parts)
+        self._mean_size = np.asarray(category.mean_size, np.float32)
+        self._mean_center = np.asarray(category.mean_center, np.float32)
+
+    def init(self, key) -> dict[str, Any]:
+        """Variables of both stages: {"params": {"root", "parts"}, "batch_stats": {...}}."""
+        points = jnp.zeros((2, self.network.num_points, 3))
+        streams = dict(zip(("params", "sample", "dropout"), jax.random.split(key, 3), strict=True))
+        both = {
+            name: jax.jit(module.init, static_argnames="train")(streams, points, train=False)
+            for name, module in (("root", self.root), ("parts", self.parts))
+        }
+        collections = sorted({c for variables in both.values() for c in variables})
+        return {c: {n: v[c] for n, v in both.items() if c in v} for c in collections}
+
+    def loss(self, params, model_state, batch, key, progress):
+        """Eqs 22 + 23 on one batch.
+
+        Args:
+          params: {"root", "parts"}.
+          model_state: mutable collections by name, each {"root", "parts"}.
+          batch: data.synthetic.scene.Batch, metres, camera frame.
+          key: PRNG key.
+          progress: fraction of the run done (unused).
+
+        Returns:
+          (loss, (new model_state, metrics)).
+        """
+        del progress
+        keys = jax.random.split(key, 3)
+        unit = self.category.unit
+        view = view_rotation(batch.points)
+        points = rotate(view, batch.points) * unit
+
+        output, root_state = self._apply("root", params, model_state, points, keys[0])
+        truth, labels, root_losses = self._choose_reading(batch, view, output)
+
+        rotation, translation = self._noisy_root(keys[1], output, truth)
+        canonical = canonicalise(points, rotation, translation)
+        parts, parts_state = self._apply("parts", params, model_state, canonical, keys[2])
+        parts_losses, metrics = self._parts_losses(canonical, parts, truth, labels)
+
+        weights = self.config.weights
+        total = losses.weighted_total(weights, root_losses).mean()
+        total += losses.weighted_total(weights, parts_losses).mean()
+        metrics |= {name: value.mean() for name, value in (root_losses | parts_losses).items()}
+        error = so3.geodesic_distance(self._root_rotation(output), truth.rotation[:, 0])
+        metrics["root_deg"] = jnp.degrees(jax.lax.stop_gradient(error)).mean()
+        new_state = {
+            name: {"root": root_state[name], "parts": parts_state[name]} for name in model_state
+        }
+        return total, (new_state, metrics)
+
+    def _apply(self, stage: str, params, model_state, points, key):
+        """One stage in training mode: (output, its new mutable collections)."""
+        module = self.root if stage == "root" else self.parts
+        sample, dropout = jax.random.split(key)
+        state = {name: value[stage] for name, value in model_state.items()}
+        return module.apply(
+            {"params": params[stage], **state},
+            points,
+            train=True,
+            rngs={"sample": sample, "dropout": dropout},
+            mutable=list(state),
+        )
+
+    def _targets(self, pose: ArticulatedPose, view) -> ArticulatedPose:
+        """Ground truth in the viewing frame and network units."""
+        unit = self.category.unit
+        length = jnp.array([unit if t == "prismatic" else 1.0 for t in self.category.joint_types])
+        return ArticulatedPose(
+            rotation=multiply(view[:, None], pose.rotation),
+            translation=rotate(view, pose.translation) * unit,
+            size=(pose.size - self._mean_size) * unit,
+            box_center=(pose.box_center - self._mean_center) * unit,
+            joint_axis=pose.joint_axis,
+            joint_pivot=pose.joint_pivot * unit,
+            joint_state=pose.joint_state * length,
+        )
+
+    def _root_losses(self, output, truth: ArticulatedPose) -> dict[str, jax.Array]:
+        axes = ["xyz".index(axis) for axis in self.category.directions]
+        directions = jnp.swapaxes(truth.rotation[:, 0], -1, -2)[:, axes]
+        return {
+            "rotation": losses.rotation_loss(output.directions, directions),
+            "translation": losses.translation_loss(output.translation, truth.translation[:, 0]),
+            "confidence": losses.confidence_loss(output.confidence, output.directions, directions),
+        }
+
+    def _choose_reading(self, batch, view, output):
+        """Truth, labels and stage I losses under the better reading of each ambiguous sample."""
+        truth = self._targets(batch.pose, view)
+        labels = batch.labels
+        chosen = self._root_losses(output, truth)
+        for equivalence in self.category.equivalences:
+            other = self._targets(second_reading(batch.pose, equivalence), view)
+            other_losses = self._root_losses(output, other)
+            weights = self.config.weights
+            better = losses.weighted_total(weights, other_losses) < losses.weighted_total(
+                weights, chosen
+            )
+            better &= is_ambiguous(batch.pose.size, equivalence)
+
+            def pick(new, old, better=better):
+                return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+            truth = jax.tree.map(pick, other, truth)
+            labels = pick(second_labels(batch.labels, equivalence), labels)
+            chosen = jax.tree.map(pick, other_losses, chosen)
+        return truth, labels, chosen
+
+    def _root_rotation(self, output):
+        """[B, 3, 3] by vertical correction of the predicted directions (Eq 3)."""
+        rotation, _ = rotation_from_directions(
+            output.directions[:, 0],
+            output.directions[:, 1],
+            output.confidence[:, 0],
+            output.confidence[:, 1],
+            self.category.directions,
+        )
+        return rotation
+
+    def _noisy_root(self, key, output, truth: ArticulatedPose):
+        """Root poses for canonicalisation: the truth with noise, or stage I's own prediction."""
+        config = self.config
+        keys = jax.random.split(key, 3)
+        batch = truth.translation.shape[0]
+        twist = jax.random.normal(keys[0], (batch, 3)) * np.radians(config.root_noise_deg)
+        shift = jax.random.normal(keys[1], (batch, 3)) * config.root_noise
+        rotation = multiply(truth.rotation[:, 0], so3.exp(twist))
+        translation = truth.translation[:, 0] + shift
+        predicted = jax.lax.stop_gradient(self._root_rotation(output))
+        off = so3.geodesic_distance(predicted, truth.rotation[:, 0])
+        own = jax.random.uniform(keys[2], (batch,)) < config.predicted_root
+        own &= off < np.radians(25.0)
+        rotation = jnp.where(own[:, None, None], predicted, rotation)
+        guess = jax.lax.stop_gradient(output.translation)
+        return rotation, jnp.where(own[:, None], guess, translation)
+
+    def _parts_losses(self, points, output, truth: ArticulatedPose, labels):
+        """Losses of stage II, and metrics for people."""
+        config = self.config
+        offsets = losses.axis_offsets(points, truth.joint_axis, truth.joint_pivot)
+        distance = jnp.sqrt((offsets * offsets).sum(-1))
+        heatmap = losses.heatmap_target(distance, config.heatmap)
+        axis, pivot = vote(points, output.heatmap, output.offset, output.direction)
+        revolute = [kind == "revolute" for kind in self.category.joint_types]
+        parts = {
+            "location": losses.location_loss(pivot, truth.joint_axis, truth.joint_pivot, revolute),
+            "direction": losses.direction_loss(axis, truth.joint_axis),
+            "heatmap": losses.heatmap_loss(output.heatmap, heatmap),
+            "offset": losses.offset_loss(output.offset, offsets, heatmap),
+            "state": losses.state_loss(output.state, truth.joint_state, config.state_penalty),
+            "scale": losses.scale_loss(output.size, truth.size)
+            + losses.scale_loss(output.center, truth.box_center),
+            "segmentation": losses.segmentation_loss(output.segmentation, labels),
+        }
+        right = (output.segmentation.argmax(-1) == labels).sum() / jnp.maximum(
+            (labels >= 0).sum(), 1
+        )
+        off = jnp.abs(output.state - truth.joint_state).mean(0)
+        metrics = {"segmentation_accuracy": right}
+        for number, kind in enumerate(self.category.joint_types):
+            name, factor = ("deg", 180 / np.pi) if kind == "revolute" else ("unit", 1.0)
+            metrics[f"state{number + 1}_{name}"] = off[number] * factor
+        return parts, metrics
