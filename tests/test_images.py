@@ -101,7 +101,8 @@ def test_jpeg_masks_do_not_count_their_noise(tmp_path):
     expected[17:40, 9:51] = True
     path = tmp_path / "mask.jpg"
     Image.fromarray(np.where(expected, 255, 0).astype(np.uint8)).save(path, quality=60)
-    assert (np.asarray(Image.open(path))[~expected] > 0).any()
+    with Image.open(path) as image:
+        assert (np.asarray(image)[~expected] > 0).any()
     np.testing.assert_array_equal(read_mask(path), expected)
 
 

@@ -180,7 +180,7 @@ def _format_pose(pose: ArticulatedPose, category: Category) -> str:
     from caper_jax.geometry import so3
 
     with jax.enable_x64(True):
-        turns = np.degrees(np.asarray(so3.log(pose.rotation.astype(np.float64))))
+        turns = np.degrees(np.asarray(jax.jit(so3.log)(pose.rotation.astype(np.float64))))
     rows = [["part", "position [m]", "rotation vector [deg]", "size [m]"]]
     for k, name in enumerate(category.parts):
         rows.append(

@@ -75,12 +75,10 @@ def pose_errors(
     Raises:
       CaperError: estimates of other shapes than the truth, or not finite although not failed.
     """
-    true = _as_double(truth, "truth", category, None)
-    frames = len(true["rotation"])
-    lost = np.zeros(frames, bool) if failed is None else np.asarray(failed, bool)
+    none = np.zeros(len(truth.rotation), bool)
+    lost = none if failed is None else np.asarray(failed, bool)
+    true = _as_double(truth, "truth", category, none)
     guess = _as_double(estimate, "estimate", category, lost)
-    if len(guess["rotation"]) != frames:
-        raise CaperError(f"{len(guess['rotation'])} estimates for {frames} frames")
 
     with jax.enable_x64(True):
         errors = {key: np.array(value) for key, value in _errors(guess, true).items()}
@@ -138,7 +136,7 @@ def equivalent_reading(
       category: gives the tree of parts.
 
     Raises:
-      CaperError: the permutation joins parts that no joint joins.
+      CaperError: the permutation joins parts that no joint, or one of another type, joins.
     """
     order = list(equivalence.permutation)
     turn = np.array(equivalence.turn)
@@ -160,20 +158,23 @@ def equivalent_reading(
 def _matching_joints(order: list[int], category: Category) -> tuple[list[int], np.ndarray]:
     """For every joint of the second reading, the joint of the first and +1, or -1 if reversed."""
     joint_of = {(parent, j + 1): j for j, parent in enumerate(category.parents)}
+    where = f"category {category.name!r}: equivalence {tuple(order)} puts"
     joints, signs = [], []
     for j, parent in enumerate(category.parents):
         ends = order[parent], order[j + 1]
-        if ends in joint_of:
-            joints.append(joint_of[ends])
-            signs.append(1.0)
-        elif ends[::-1] in joint_of:
-            joints.append(joint_of[ends[::-1]])
-            signs.append(-1.0)
-        else:
+        reverse = ends not in joint_of
+        joint = joint_of.get(ends[::-1] if reverse else ends)
+        if joint is None:
             raise CaperError(
-                f"category {category.name!r}: equivalence {tuple(order)} puts a joint between "
-                f"parts {ends[0]} and {ends[1]}, which have none"
+                f"{where} a joint between parts {ends[0]} and {ends[1]}, which have none"
             )
+        kind, expected = category.joint_types[joint], category.joint_types[j]
+        if kind != expected:
+            raise CaperError(
+                f"{where} the {kind} joint of part {joint + 1} where a {expected} one belongs"
+            )
+        joints.append(joint)
+        signs.append(-1.0 if reverse else 1.0)
     return joints, np.array(signs)
 
 
@@ -218,16 +219,17 @@ def _axis_distance(arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _as_double(
-    pose: ArticulatedPose, name: str, category: Category, lost: np.ndarray | None
+    pose: ArticulatedPose, name: str, category: Category, lost: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Fields [F, ...] in float64; failed frames get a harmless pose, which is not used."""
     arrays = {}
     for key, shape in pose_shapes(category.num_parts).items():
         array = np.array(getattr(pose, key), np.float64)
-        if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
-            raise CaperError(f"{name} {key} has shape {array.shape}, expected (frames, *{shape})")
-        if lost is not None:
-            array[lost] = np.eye(3) if key == "rotation" else 1.0
+        if array.shape != (len(lost), *shape):
+            raise CaperError(
+                f"{name} {key} has shape {array.shape}, expected {(len(lost), *shape)}"
+            )
+        array[lost] = np.eye(3) if key == "rotation" else 1.0
         if not np.isfinite(array).all():
             raise CaperError(f"{name} {key} has NaN or infinite entries")
         arrays[key] = array

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from caper_jax.articulation.category import Category
@@ -140,21 +141,20 @@ def mean_predictor(category: Category, mean_pose: Mapping[str, Any], source: str
         if values[key].shape != shape or not np.isfinite(values[key]).all():
             raise CaperError(f"{source}: mean_pose {key} must be finite numbers {shape}")
 
-    def predict(frames: Sequence[Frame], points: np.ndarray) -> ArticulatedPose:
-        batch = len(points)
-        repeated = {key: np.repeat(value[None], batch, 0) for key, value in values.items()}
-        root = se3.from_rt(repeated["rotation"], points.mean(1) + repeated["offset"])
+    @jax.jit
+    def place(middle: jax.Array) -> ArticulatedPose:
+        repeated = {
+            key: jnp.broadcast_to(value, (len(middle), *value.shape))
+            for key, value in values.items()
+        }
+        root = se3.from_rt(repeated.pop("rotation"), middle + repeated.pop("offset"))
         joints = (repeated["joint_axis"], repeated["joint_pivot"], repeated["joint_state"])
         parts = forward_kinematics(root, *joints, category.joint_types, category.parents)
-        return ArticulatedPose(
-            rotation=parts[..., :3, :3],
-            translation=parts[..., :3, 3],
-            size=repeated["size"],
-            box_center=repeated["box_center"],
-            joint_axis=joints[0],
-            joint_pivot=joints[1],
-            joint_state=joints[2],
-        )
+        rotation, translation = parts[..., :3, :3], parts[..., :3, 3]
+        return ArticulatedPose(rotation=rotation, translation=translation, **repeated)
+
+    def predict(frames: Sequence[Frame], points: np.ndarray) -> ArticulatedPose:
+        return place(points.mean(1))
 
     return predict
 

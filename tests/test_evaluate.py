@@ -1,0 +1,265 @@
+"""``caper evaluate`` from end to end: what it counts, writes and refuses."""
+
+import dataclasses
+import json
+import sys
+import types
+
+import jax
+import numpy as np
+import pytest
+from frames import random_frames
+from scipy.spatial.transform import Rotation
+
+from caper_jax import categories, cli
+from caper_jax.data.hdf5 import Hdf5Dataset, write
+from caper_jax.errors import CaperError
+from caper_jax.evaluation import protocol, report
+
+BOX = categories.get("box")
+FRAMES = 21
+MEAN_POSE = {
+    "rotation": Rotation.from_rotvec([0.3, 0.2, 0.1]).as_matrix().tolist(),
+    "offset": [0.0, 0.01, 0.02],
+    "size": [[0.2, 0.05, 0.1]] * 2,
+    "box_center": [[0.0, 0.0, 0.0]] * 2,
+    "joint_axis": [[-1.0, 0.0, 0.0]],
+    "joint_pivot": [[0.0, 0.01, -0.05]],
+    "joint_state": [1.2],
+}
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "box_test.h5"
+    write(path, category=BOX, split="test", **random_frames(FRAMES, 1500))
+    return path
+
+
+@pytest.fixture
+def estimator(monkeypatch):
+    """Stands for ``caper_jax.estimator``: its estimate is the identity, 1 m away, state 0."""
+
+    class Estimator:
+        category, card = BOX, {"mean_pose": MEAN_POSE}
+
+        def __call__(self, points):
+            assert points.shape == (protocol.BATCH_SIZE, protocol.NUM_POINTS, 3)
+            pose = protocol.mean_predictor(BOX, MEAN_POSE, "card")((), points)
+            return types.SimpleNamespace(pose=pose)
+
+    module = types.ModuleType("caper_jax.estimator")
+    module.load = lambda category, weights=None: Estimator()
+    monkeypatch.setitem(sys.modules, "caper_jax.estimator", module)
+    return Estimator
+
+
+def run(path, out, *options):
+    return cli.main(
+        ["evaluate", "--category", "box", "--data", str(path), "--format", "caper"]
+        + ["--out", str(out), *options]
+    )
+
+
+def test_the_truth_scores_perfectly_from_file_to_report(path, tmp_path, capsys):
+    assert run(path, tmp_path / "new" / "out", "--predictor", "truth") == 0
+    metrics = json.loads((tmp_path / "new/out/metrics.json").read_text())
+    assert list(metrics)[:9] == [
+        *("category", "format", "split", "frames", "failures", "mask_source", "parts", "joints"),
+        "seconds_per_frame",
+    ]
+    assert [metrics[key] for key in list(metrics)[:6]] == [
+        *("box", "caper", "test", FRAMES, 0, "simulated")
+    ]
+    for tables in (metrics, metrics["up_to_symmetry"]):
+        assert [part["name"] for part in tables["parts"]] == ["base", "lid"]
+        for part in tables["parts"]:
+            for statistic in ("mean", "median"):
+                assert part["rotation_deg"][statistic] == part["translation_m"][statistic] == 0
+                assert part["iou_full"][statistic] == pytest.approx(1, abs=1e-9)
+                assert part["iou_size"][statistic] == pytest.approx(1, abs=1e-9)
+        (joint,) = tables["joints"]
+        assert (joint["type"], joint["state_unit"]) == ("revolute", "degrees")
+        assert joint["axis_deg"]["mean"] == joint["pivot_m"]["mean"] == joint["state"]["mean"] == 0
+    table = capsys.readouterr().out
+    assert "21 frames, 0 failed" in table and "up to symmetry (" in table
+    assert max(map(len, table.splitlines()[:-1])) <= 80
+
+
+def test_every_figure_can_be_computed_from_the_predictions(path, tmp_path, estimator):
+    """SciPy and NumPy on predictions.npz and the dataset alone."""
+    assert run(path, tmp_path) == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["predictor"] == "model" and metrics["seconds_per_frame"] > 0
+    saved = np.load(tmp_path / "predictions.npz", allow_pickle=False)
+    dataset = Hdf5Dataset(path)
+    assert saved["frame"].tolist() == list(dataset.names)
+    assert not saved["failed"].any()
+    for key, field in (("R", "rotation"), ("t", "translation"), ("joint_state", "joint_state")):
+        truth = np.stack([getattr(dataset[i].truth, field) for i in range(FRAMES)])
+        np.testing.assert_array_equal(saved[f"truth_{key}"], truth)
+        assert saved[key].shape == truth.shape
+    for k in range(2):
+        relative = Rotation.from_matrix(saved["R"][:, k]).inv() * Rotation.from_matrix(
+            saved["truth_R"][:, k]
+        )
+        degrees = np.degrees(relative.magnitude())
+        distance = np.linalg.norm(saved["t"][:, k] - saved["truth_t"][:, k], axis=-1)
+        sizes = saved["size"][:, k], saved["truth_size"][:, k]
+        shared = np.minimum(*sizes).prod(-1)
+        iou = shared / (sizes[0].prod(-1) + sizes[1].prod(-1) - shared)
+        part = metrics["parts"][k]
+        for name, values in (("rotation_deg", degrees), ("translation_m", distance)):
+            assert part[name]["mean"] == pytest.approx(values.mean(), rel=1e-4)
+            assert part[name]["median"] == pytest.approx(np.median(values), rel=1e-4)
+        assert part["iou_size"]["mean"] == pytest.approx(iou.mean(), rel=1e-5)
+    axis, true_axis = saved["joint_axis"][:, 0], saved["truth_joint_axis"][:, 0]
+    offset = saved["joint_pivot"][:, 0] - saved["truth_joint_pivot"][:, 0]
+    joint = metrics["joints"][0]
+    for name, values in (
+        ("axis_deg", np.degrees(np.arccos((axis * true_axis).sum(-1)))),
+        ("pivot_m", np.linalg.norm(np.cross(offset, true_axis), axis=-1)),
+        ("state", np.degrees(np.abs(saved["joint_state"] - saved["truth_joint_state"]))),
+    ):
+        assert joint[name]["mean"] == pytest.approx(values.mean(), rel=1e-4)
+
+
+def test_the_mean_stands_at_the_cloud_and_obeys_kinematics(path):
+    dataset = Hdf5Dataset(path)
+    frames = [dataset[i] for i in range(3)]
+    points = np.stack([frame.points for frame in frames])
+    pose = protocol.mean_predictor(BOX, MEAN_POSE, "card")(frames, points)
+    root = np.array(MEAN_POSE["rotation"])
+    expected = points.mean(1) + MEAN_POSE["offset"]
+    np.testing.assert_allclose(pose.translation[:, 0], expected, atol=1e-6)
+    lid = root @ Rotation.from_rotvec([-1.2, 0, 0]).as_matrix()
+    np.testing.assert_allclose(pose.rotation[:, 1], np.tile(lid, (3, 1, 1)), atol=1e-6)
+    hinge = np.array(MEAN_POSE["joint_pivot"][0])
+    for k, rotation in enumerate((root, lid)):  # the hinge is where both parts have it
+        found = rotation @ hinge + pose.translation[:, k]
+        np.testing.assert_allclose(found, expected + root @ hinge, atol=1e-6)
+
+
+def test_mean_predictor_runs_from_the_card(path, tmp_path, estimator, capsys):
+    assert run(path, tmp_path, "--predictor", "mean", "--limit", "5") == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["frames"] == 5 and metrics["predictor"] == "mean"
+    for broken, message in (
+        ({k: v for k, v in MEAN_POSE.items() if k != "offset"}, "mean_pose lacks 'offset'"),
+        ({**MEAN_POSE, "size": [1, 2, 3]}, "mean_pose size must be finite numbers (2, 3)"),
+    ):
+        estimator.card = {"mean_pose": broken}
+        assert run(path, tmp_path, "--predictor", "mean") == 2
+        assert message in capsys.readouterr().err
+    estimator.card = {}
+    assert run(path, tmp_path, "--predictor", "mean") == 2
+    assert "has no mean_pose" in capsys.readouterr().err
+
+
+class Changed:
+    """A dataset with some of its frames replaced."""
+
+    def __init__(self, dataset, changes):
+        self._dataset, self._changes = dataset, changes
+        self.category, self.names = dataset.category, dataset.names
+        self.format, self.split = dataset.format, dataset.split
+        self.mask_source = dataset.mask_source
+
+    def __len__(self):
+        return len(self._dataset)
+
+    def __getitem__(self, index):
+        frame = self._dataset[index]
+        return dataclasses.replace(frame, **self._changes.get(index, {}))
+
+
+def test_frames_that_fail_are_counted_not_dropped(path, tmp_path):
+    dataset = Changed(Hdf5Dataset(path), {4: {"points": np.zeros((3, 3), np.float32)}})
+    calls = []
+
+    def predictor(frames, points):
+        calls.append(points.shape)
+        pose = protocol.truth_predictor(frames, points)
+        rotation = pose.rotation.copy()
+        rotation[[frame.name == "000020" for frame in frames]] = np.nan
+        return pose.replace(rotation=rotation)
+
+    evaluation = protocol.evaluate(dataset, predictor)
+    assert set(calls) == {(protocol.BATCH_SIZE, protocol.NUM_POINTS, 3)}
+    assert np.flatnonzero(evaluation.failed).tolist() == [4, 20]
+    result = report.summarise(evaluation, dataset, "model", "here")
+    assert (result["frames"], result["failures"]) == (FRAMES, 2)
+    assert result["parts"][0]["rotation_deg"]["mean"] == pytest.approx(2 * 180 / FRAMES)
+    assert result["parts"][0]["iou_full"]["mean"] == pytest.approx((FRAMES - 2) / FRAMES)
+    assert result["parts"][1]["rotation_deg"]["median"] == 0
+    report.write_report(tmp_path, evaluation, result)
+    saved = np.load(tmp_path / "predictions.npz")
+    assert np.isnan(saved["joint_state"][[4, 20]]).all()
+    assert not np.isnan(saved["joint_state"]).all(-1)[[0, 19]].any()
+    assert not np.isnan(saved["truth_R"]).any()
+
+
+def test_frames_without_good_truth_are_refused(path):
+    dataset = Hdf5Dataset(path)
+    truth = dataset[2].truth
+    for change, message in (
+        ({"truth": None}, "frame '000002' has no ground truth"),
+        ({"truth": truth.replace(size=-truth.size)}, "ground truth of frame '000002': size must"),
+    ):
+        with pytest.raises(CaperError, match=message):
+            protocol.evaluate(Changed(dataset, {2: change}), protocol.truth_predictor)
+
+
+def test_clouds_are_spread_over_all_points(path):
+    dataset = Hdf5Dataset(path)
+    seen = []
+
+    def predictor(frames, points):
+        seen.append(points)
+        return protocol.truth_predictor(frames, points)
+
+    evaluation = protocol.evaluate(dataset, predictor, limit=2, batch_size=2, num_points=500)
+    np.testing.assert_array_equal(seen[0][1], dataset[1].points[1::3])
+    assert evaluation.names == ["000000", "000001"]
+    assert jax.tree.leaves(evaluation.estimate)[0].shape[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--format", "artimage"], "unknown format 'artimage'"),
+        (["--category", "bxo"], "unknown category 'bxo'; did you mean 'box'"),
+        (["--split", "train"], "holds split 'test', not 'train'"),
+        (["--data", "absent.h5"], "absent.h5: no such file"),
+        (["--limit", "0"], "whole number above 0"),
+        (["--predictor", "best"], "invalid choice"),
+    ],
+)
+def test_mistakes_are_one_line_and_code_2(path, tmp_path, capsys, options, message):
+    assert run(path, tmp_path / "out", "--predictor", "truth", *options) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err and captured.out == ""
+    assert captured.err.splitlines()[-1].startswith("caper evaluate: error: ")
+    assert not (tmp_path / "out").exists()
+
+
+def test_output_problems_are_found_before_any_work(path, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("caper_jax.data.open_dataset", lambda *_: pytest.fail("began to work"))
+    assert run(path, path, "--predictor", "truth") == 2
+    assert "is a file; give a folder" in capsys.readouterr().err
+    assert run(path, path / "below", "--predictor", "truth") == 2
+    assert "is a file; give a folder" in capsys.readouterr().err
+
+
+def test_reartmix_truth_scores_perfectly(shared_data, tmp_path, capsys):
+    assert (
+        cli.main(
+            ["evaluate", "--category", "box", "--format", "reartmix", "--predictor", "truth"]
+            + ["--data", str(shared_data / "reartmix_box"), "--out", str(tmp_path), "--limit", "8"]
+        )
+        == 0
+    )
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["mask_source"] == "annotated polygons" and metrics["failures"] == 0
+    assert metrics["parts"][1]["rotation_deg"]["mean"] == 0
+    assert metrics["parts"][1]["iou_full"]["mean"] == pytest.approx(1, abs=1e-9)
