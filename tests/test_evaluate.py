@@ -76,8 +76,7 @@ def test_the_truth_scores_perfectly_from_file_to_report(path, tmp_path, capsys):
         for part in tables["parts"]:
             for statistic in ("mean", "median"):
                 assert part["rotation_deg"][statistic] == part["translation_m"][statistic] == 0
-                assert part["iou_full"][statistic] == pytest.approx(1, abs=1e-9)
-                assert part["iou_size"][statistic] == pytest.approx(1, abs=1e-9)
+                assert part["iou_full"][statistic] == part["iou_size"][statistic] == 1
         (joint,) = tables["joints"]
         assert (joint["type"], joint["state_unit"]) == ("revolute", "degrees")
         assert joint["axis_deg"]["mean"] == joint["pivot_m"]["mean"] == joint["state"]["mean"] == 0
@@ -262,4 +261,4 @@ def test_reartmix_truth_scores_perfectly(shared_data, tmp_path, capsys):
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["mask_source"] == "annotated polygons" and metrics["failures"] == 0
     assert metrics["parts"][1]["rotation_deg"]["mean"] == 0
-    assert metrics["parts"][1]["iou_full"]["mean"] == pytest.approx(1, abs=1e-9)
+    assert metrics["parts"][1]["iou_full"]["mean"] == 1

@@ -42,12 +42,8 @@ def build_parser() -> argparse.ArgumentParser:
         "with a mask or a 2D box (what stands on the table inside it), or as a point cloud.",
         [
             ("--category box --depth d.png --mask m.png --intrinsics cam.json", "prints the pose"),
-            (
-                "--category box --depth d.png --box 847,198,1204,489 --intrinsics cam.json "
-                "--picture pose.png",
-                "draws it",
-            ),
-            ("--category box --points cloud.ply --json pose.json", "writes it"),
+            ("--category box --depth d.png --box 10,20,90,80 --intrinsics cam.json", "likewise"),
+            ("--category box --points cloud.ply --json pose.json --picture pose.png", "keeps it"),
         ],
     )
     parser.add_argument("--category", required=True, help="category of the object, e.g. box")
