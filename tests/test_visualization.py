@@ -9,15 +9,18 @@ import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 from PIL import Image
 
+from caper_jax import categories, cli
 from caper_jax.articulation.category import Category, Joint
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.cli import demo
 from caper_jax.errors import CaperError
 from caper_jax.visualization import scene as scenes
 from caper_jax.visualization.page import write_page
@@ -252,3 +255,58 @@ def test_writing_needs_scenes_and_a_folder(tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(CaperError, match="cannot write"):
         write_page(tmp_path / "file" / "a.html", [arm_scene(truth=None)])
+
+
+def test_demo_writes_pictures_and_a_page_and_prints_errors(tmp_path, monkeypatch, capsys):
+    """With an estimator that knows the truth: stored states are degrees, errors come out as 0."""
+    monkeypatch.setattr(demo, "demo_folder", lambda: tmp_path / "frames")
+    pose = box_pose(np.radians(40.0))
+    for index in range(2):
+        write_demo_frame(tmp_path / "frames" / f"box_{index}", pose)
+
+    def estimator(points: np.ndarray) -> SimpleNamespace:
+        batched = jax.tree.map(lambda array: np.asarray(array, np.float32)[None], pose)
+        assert points.dtype == np.float32
+        return SimpleNamespace(pose=batched, labels=np.zeros(points.shape[:2], np.int32))
+
+    monkeypatch.setattr(demo, "load_estimator", lambda category: estimator)
+    assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 0
+    captured = capsys.readouterr()
+    assert max(map(len, captured.out.splitlines()[:-2])) <= 80
+    assert captured.out.count("40.0°") == 2
+    assert re.search(r"error +0\.0 mm +0\.00° +IoU 1\.00", captured.out)
+    assert "ms per frame (median of 20)" in captured.out
+    assert "21/21 (100 %)" in captured.err
+    assert read_png(tmp_path / "out" / "box.png").size
+    data = page_data((tmp_path / "out" / "index.html").read_text("utf-8"))
+    assert [scene["name"] for scene in data["scenes"]] == ["box 0", "box 1"]
+
+    (tmp_path / "frames" / "box_1" / "truth.json").write_text("{}")
+    assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 2
+    assert "truth.json: no pose of box" in capsys.readouterr().err
+
+
+def box_pose(angle: float) -> ArticulatedPose:
+    category = categories.get("box")
+    axis, pivot = np.array([[-1.0, 0.0, 0.0]]), np.array([[0.0, 0.02, -0.05]])
+    with jax.enable_x64(True):
+        state = np.array([angle])
+        parts = np.asarray(
+            forward_kinematics(ROOT, axis, pivot, state, category.joint_types, category.parents)
+        )
+    size, center = np.array(category.mean_size), np.array(category.mean_center)
+    return ArticulatedPose(parts[:, :3, :3], parts[:, :3, 3], size, center, axis, pivot, state)
+
+
+def write_demo_frame(folder: Path, pose: ArticulatedPose) -> None:
+    folder.mkdir(parents=True)
+    depth = np.full((120, 160), 900, np.uint16)
+    Image.fromarray(depth).save(folder / "depth.png")
+    mask = np.zeros((120, 160), np.uint8)
+    mask[40:90, 50:120] = 255
+    Image.fromarray(mask).save(folder / "mask.png")
+    camera = {"fx": 200.0, "fy": 200.0, "cx": 80.0, "cy": 60.0}
+    (folder / "intrinsics.json").write_text(json.dumps(camera))
+    truth = {key: np.asarray(value).tolist() for key, value in vars(pose).items()}
+    truth["joint_state"] = np.degrees(pose.joint_state).tolist()
+    (folder / "truth.json").write_text(json.dumps(truth))

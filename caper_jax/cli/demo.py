@@ -27,9 +27,9 @@ TIMED_CALLS = 10  # per frame, after the first
 def build_parser() -> argparse.ArgumentParser:
     parser = common.create_parser(
         "demo",
-        "Estimates the objects in the depth frames that ship with the package, compares them with\n"
-        "the ground truth, and draws them: a picture per category, and one page to turn in a\n"
-        "browser.",
+        "Estimates the objects in the depth frames that ship with the package, compares\n"
+        "them with the ground truth, and draws them: a picture per category, and one page\n"
+        "to turn in a browser.",
         [
             ("", "all categories"),
             ("--category box", "one category"),
@@ -106,7 +106,7 @@ def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
     from caper_jax.visualization.scene import Scene
     from caper_jax.visualization.table import format_scene
 
-    scenes = []
+    scenes: list[Scene] = []
     first = 0.0
     seconds: list[float] = []
     calls = 1 + TIMED_CALLS * len(folders)

@@ -116,7 +116,7 @@ def _scene_data(scene: Scene) -> dict[str, Any]:
         "counts": np.bincount(scene.labels, minlength=category.num_parts).tolist(),
         "estimate": _pose_data(scene.pose, category),
         "truth": None if scene.truth is None else _pose_data(scene.truth, category),
-        "image": None if scene.depth is None else _image_address(scene),
+        "image": None if scene.depth is None else _image_address(scene, scene.depth),
     }
 
 
@@ -139,14 +139,13 @@ def _slider_limits(scene: Scene, joint: int) -> list[float]:
     return _rounded([min(low, *states), max(high, *states)])
 
 
-def _image_address(scene: Scene) -> str:
+def _image_address(scene: Scene, depth: np.ndarray) -> str:
     """The depth image around the object as a PNG in a data address; dimmed beside the mask."""
-    depth = np.nan_to_num(scene.depth)
     low, high = crop_box(scene)
     left, top = np.clip(np.floor(low), 0, None).astype(int)
     right, bottom = np.ceil(high).astype(int)
     window = (slice(top, bottom), slice(left, right))
-    depth = depth[window]
+    depth = np.nan_to_num(depth[window])
     near, far = depth_range(scene)
     shade = np.clip((depth - near) / (far - near), 0, 1)
     colors = matplotlib.colormaps["viridis_r"](shade)[..., :3]

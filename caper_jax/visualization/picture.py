@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import matplotlib.patheffects as effects
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -33,7 +35,7 @@ from caper_jax.visualization.scene import (
 TITLES = ("Depth image and mask", "Estimate over the depth image", "Seen from another side")
 DPI = 110
 ROW_HEIGHT = 3.9  # inches
-WIDTHS = (3.4, 3.4, 3.4, 3.3)  # inches: three views and the legend
+WIDTHS = (3.4, 3.4, 3.4, 3.6)  # inches: three views and the legend
 INK, PAPER, TRUTH = "#1a1a1a", "#f4f4f2", "#333333"
 
 Projection = Callable[[np.ndarray], np.ndarray]
@@ -90,8 +92,15 @@ def _draw_input(axes: Axes, scene: Scene) -> None:
     colors = matplotlib.colormaps["viridis_r"].with_extremes(bad="#d9d9d9")
     if scene.depth is None:
         pixels = project(scene.points, _intrinsics(scene))
-        shown = axes.scatter(
-            *pixels.T, c=scene.points[:, 2], s=4, cmap=colors, vmin=near, vmax=far, linewidths=0
+        shown: ScalarMappable = axes.scatter(
+            pixels[:, 0],
+            pixels[:, 1],
+            c=scene.points[:, 2],
+            s=4,
+            cmap=colors,
+            vmin=near,
+            vmax=far,
+            linewidths=0,
         )
         axes.set_facecolor(PAPER)
     else:
@@ -153,7 +162,8 @@ def _draw_objects(
     """Points, boxes and joint axes through one projection."""
     colors = np.array([part_color(part) for part in range(scene.category.num_parts)])
     points = flat(scene.points)[far_first]
-    axes.scatter(*points.T, c=colors[scene.labels[far_first]], s=5, linewidths=0, alpha=0.75)
+    x, y = points.T
+    axes.scatter(x, y, c=colors[scene.labels[far_first]], s=5, linewidths=0, alpha=0.75)
     halo = [effects.withStroke(linewidth=3.4, foreground="white", alpha=0.8)]
     if scene.truth is not None:
         for corners in box_corners(scene.truth):
@@ -162,7 +172,7 @@ def _draw_objects(
                 axes.plot(*line.T, color=TRUTH, linewidth=0.9, linestyle=(0, (5, 3)), zorder=3)
     for part, corners in enumerate(box_corners(scene.pose)):
         for (a, b), hidden in zip(BOX_EDGES, hidden_edges(corners, eye), strict=True):
-            style = (
+            style: dict[str, Any] = (
                 {"linewidth": 1.0, "linestyle": (0, (1, 2)), "zorder": 4}
                 if hidden
                 else {"linewidth": 2.0, "path_effects": halo, "zorder": 5}
@@ -183,7 +193,7 @@ def _draw_joints(
         if dashed:
             axes.plot(*np.stack([start, end]).T, color=TRUTH, linewidth=1, linestyle=(0, (5, 3)))
             continue
-        arrow = {
+        arrow: dict[str, Any] = {
             "arrowstyle": "-|>,head_length=0.6,head_width=0.25",
             "color": "black",
             "linewidth": 1.8,

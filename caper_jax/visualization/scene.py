@@ -1,4 +1,4 @@
-"""One frame with its estimate, and the lines that pictures draw of it. All in NumPy.
+"""One frame with its estimate, and the lines that pictures draw of it, as NumPy arrays.
 
 Everything is in the camera's frame (OpenCV: x right, y down, z forward), metres.
 """
@@ -7,18 +7,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.schema import pose_shapes
 from caper_jax.errors import CaperError
+from caper_jax.geometry import boxes
 
 # Okabe and Ito's colours, which colour-blind people can tell apart; yellow, hard to see on white,
 # comes last.
 PART_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442")
 
-# Corners as sign patterns (x slowest, z fastest); an edge joins corners that differ in one sign.
+# Corners in the order of ``boxes.corners``, as signs; an edge joins corners that differ in one.
 CORNER_SIGNS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 BOX_EDGES = tuple(
     (a, b)
@@ -77,12 +79,12 @@ class Scene:
                 if array.shape != shape or not np.isfinite(array).all():
                     problems.append(f"{which}.{key} must be finite {shape}, got {array.shape}")
         if self.depth is not None:
-            if np.ndim(self.depth) != 2:
-                problems.append(f"depth must be [H, W], got {np.shape(self.depth)}")
-            if np.shape(self.intrinsics) != (3, 3):
+            if self.depth.ndim != 2:
+                problems.append(f"depth must be [H, W], got {self.depth.shape}")
+            if self.intrinsics is None or self.intrinsics.shape != (3, 3):
                 problems.append("depth needs intrinsics [3, 3]")
-            if self.mask is not None and np.shape(self.mask) != np.shape(self.depth):
-                problems.append(f"mask is {np.shape(self.mask)}, depth {np.shape(self.depth)}")
+            if self.mask is not None and self.mask.shape != self.depth.shape:
+                problems.append(f"mask is {self.mask.shape}, depth {self.depth.shape}")
         if problems:
             raise CaperError(f"scene {self.name!r}: {'; '.join(problems)}")
 
@@ -100,10 +102,9 @@ def part_color(part: int) -> str:
 
 def box_corners(pose: ArticulatedPose) -> np.ndarray:
     """[K, 8, 3] corners of all parts' boxes in the camera's frame, in ``CORNER_SIGNS`` order."""
-    size, center = np.asarray(pose.size, float), np.asarray(pose.box_center, float)
-    rest = center[:, None] + CORNER_SIGNS * size[:, None] / 2
-    rotation, translation = np.asarray(pose.rotation, float), np.asarray(pose.translation, float)
-    return np.einsum("kij,knj->kni", rotation, rest) + translation[:, None]
+    arrays = (pose.rotation, pose.translation, pose.box_center, pose.size)
+    with jax.enable_x64(True):
+        return np.asarray(boxes.corners(*(np.asarray(array, np.float64) for array in arrays)))
 
 
 def joint_lines(pose: ArticulatedPose, category: Category) -> tuple[np.ndarray, np.ndarray]:

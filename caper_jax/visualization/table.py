@@ -81,4 +81,5 @@ def _batched(pose: ArticulatedPose) -> ArticulatedPose:
 
 
 def _triple(values: np.ndarray, digits: int) -> str:
-    return " ".join(f"{value:.{digits}f}" for value in values)
+    # Adding 0 turns -0.0 into 0.0.
+    return " ".join(f"{value:.{digits}f}" for value in np.round(values, digits) + 0.0)
