@@ -1,0 +1,1 @@
+"""How good estimates are: errors, the protocol that produces them, and the report."""
