@@ -9,7 +9,6 @@ import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -22,6 +21,7 @@ from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.cli import demo
 from caper_jax.errors import CaperError
+from caper_jax.estimator import Prediction
 from caper_jax.visualization import scene as scenes
 from caper_jax.visualization.page import write_page
 from caper_jax.visualization.picture import write_picture
@@ -264,10 +264,15 @@ def test_demo_writes_pictures_and_a_page_and_prints_errors(tmp_path, monkeypatch
     for index in range(2):
         write_demo_frame(tmp_path / "frames" / f"box_{index}", pose)
 
-    def estimator(points: np.ndarray) -> SimpleNamespace:
-        batched = jax.tree.map(lambda array: np.asarray(array, np.float32)[None], pose)
+    def estimator(points: np.ndarray) -> Prediction:
         assert points.dtype == np.float32
-        return SimpleNamespace(pose=batched, labels=np.zeros(points.shape[:2], np.int32))
+        return Prediction(
+            pose=jax.tree.map(lambda array: np.asarray(array, np.float32)[None], pose),
+            points=points[:, ::2],
+            labels=np.zeros((1, points.shape[1] // 2), np.int32),
+            confidence=np.ones((1, 2), np.float32),
+            degenerate=np.zeros(1, bool),
+        )
 
     monkeypatch.setattr(demo, "load_estimator", lambda category: estimator)
     assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 0

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from caper_jax.errors import CaperError
 if TYPE_CHECKING:
     from caper_jax.articulation.category import Category
     from caper_jax.articulation.pose import ArticulatedPose
+    from caper_jax.estimator import Prediction
     from caper_jax.visualization.scene import Scene
 
 TIMED_CALLS = 10  # per frame, after the first
@@ -66,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def load_estimator(category: str) -> Callable[[np.ndarray], Any]:
+def load_estimator(category: str) -> Callable[[np.ndarray], Prediction]:
     """The estimator with the weights that ship with the package."""
     from caper_jax import estimator
 
@@ -120,13 +121,14 @@ def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
                 first = _timed(estimator, points)[1]
                 bar.update(1)
             for _ in range(TIMED_CALLS):
-                (pose, labels), spent = _timed(estimator, points)
+                found, spent = _timed(estimator, points)
                 seconds.append(spent)
                 bar.update(1)
             truth = _read_truth(folder / "truth.json", category)
             name = folder.name.replace("_", " ")
+            cloud, labels = found.points, found.labels
             scenes.append(
-                Scene(name, category, points, labels, pose, truth, depth, mask, intrinsics)
+                Scene(name, category, cloud, labels, found.pose, truth, depth, mask, intrinsics)
             )
     for scene in scenes:
         print(f"\n{scene.name}\n{format_scene(scene)}")
@@ -138,17 +140,16 @@ def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
 
 
 def _timed(
-    estimator: Callable[[np.ndarray], Any], points: np.ndarray
-) -> tuple[tuple[ArticulatedPose, np.ndarray], float]:
-    """The estimate of one frame, pose and labels without batch axes, and its seconds."""
+    estimator: Callable[[np.ndarray], Prediction], points: np.ndarray
+) -> tuple[Prediction, float]:
+    """The estimate of one frame, without batch axes, and the seconds it took."""
     import jax
 
     began = time.perf_counter()
-    prediction = estimator(points[None])
     # Fetching the arrays waits for them: JAX returns before it has computed.
-    fetched = jax.device_get((prediction.pose, prediction.labels))
+    prediction = jax.device_get(estimator(points[None]))
     spent = time.perf_counter() - began
-    return jax.tree.map(lambda array: np.asarray(array)[0], fetched), spent
+    return jax.tree.map(lambda array: np.asarray(array)[0], prediction), spent
 
 
 def _read_truth(path: Path, category: Category) -> ArticulatedPose:
