@@ -178,36 +178,30 @@ def test_data_from_the_host_and_arrays_for_the_generator_give_the_same_run(tmp_p
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
-def test_a_stopped_run_resumes_to_the_same_bits(tmp_path, capsys):
-    """SIGTERM amid a line of metrics; the last dispatch is a short one."""
-    settings = config(steps=30, steps_per_dispatch=4)
+def test_a_stopped_run_resumes_to_the_same_bits(tmp_path, capsys, monkeypatch):
+    """SIGTERM in the first dispatch, amid a line of metrics; the last dispatch is a short one."""
+    settings = config(steps=6, steps_per_dispatch=4, log_steps=3)
     straight = fit(tmp_path / "a", settings, loss_fn, variables(), batch_fn=batch_fn)
 
-    def stopped_after(dispatches):
-        count = 0
-        original = loop.make_step
+    def make_stopping_step(*args, **kwargs):
+        step = make_step(*args, **kwargs)
 
-        def make_counting_step(*args, **kwargs):
-            step = original(*args, **kwargs)
+        def stopping(*given):
+            signal.raise_signal(signal.SIGTERM)
+            return step(*given)
 
-            def counting(*given):
-                nonlocal count
-                count += 1
-                if count == dispatches:
-                    signal.raise_signal(signal.SIGTERM)
-                return step(*given)
+        return stopping
 
-            return counting
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(loop, "make_step", make_counting_step)
-            return fit(tmp_path / "b", settings, loss_fn, variables(), batch_fn=batch_fn)
-
-    first, last = stopped_after(3), stopped_after(10**9)
-    assert int(first.state.step) == 12 and not first.finished and last.finished
-    assert "stopped at step 12; the same command resumes" in capsys.readouterr().err
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "make_step", make_stopping_step)
+        first = fit(tmp_path / "b", settings, loss_fn, variables(), batch_fn=batch_fn)
+    assert not first.finished and int(first.state.step) == 4
+    assert "stopped at step 4; the same command resumes" in capsys.readouterr().err
+    last = fit(tmp_path / "b", settings, loss_fn, variables(), batch_fn=batch_fn)
+    assert last.finished and int(last.state.step) == 6
     assert_same_bits(without_clock(last.state), without_clock(straight.state))
     assert metrics_of(tmp_path / "b") == metrics_of(tmp_path / "a")
+    assert [line["step"] for line in metrics_of(tmp_path / "b")] == [3, 6]
     assert last.state.elapsed > first.state.elapsed > 0
 
 
