@@ -2,8 +2,6 @@
 
 import json
 import os
-import sys
-import types
 
 import jax
 import numpy as np
@@ -12,8 +10,19 @@ from frames import random_pose
 from PIL import Image
 
 from caper_jax import cli
+from caper_jax.estimator import Prediction
 
 CAMERA = {"fx": 300.0, "fy": 310.0, "cx": 79.5, "cy": 59.5}
+
+
+def prediction(points, pose):
+    return Prediction(
+        pose=pose,
+        points=points,
+        labels=np.arange(points.shape[1], dtype=np.int32)[None] % 2,
+        confidence=np.array([[0.75, 0.5]], np.float32),
+        degenerate=np.array([False]),
+    )
 
 
 @pytest.fixture
@@ -24,15 +33,9 @@ def seen(monkeypatch):
     class Estimator:
         def __call__(self, points):
             clouds.append(np.asarray(points))
-            return types.SimpleNamespace(
-                pose=random_pose(1),
-                labels=np.arange(points.shape[1], dtype=np.int32)[None] % 2,
-                confidence=np.array([[0.75, 0.5]], np.float32),
-            )
+            return prediction(points, random_pose(1))
 
-    module = types.ModuleType("caper_jax.estimator")
-    module.load = lambda category, weights=None: Estimator()
-    monkeypatch.setitem(sys.modules, "caper_jax.estimator", module)
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: Estimator())
     return clouds
 
 
@@ -144,10 +147,8 @@ def test_an_estimate_that_is_not_finite_is_an_error(files, seen, capsys, monkeyp
     class Lost:
         def __call__(self, points):
             pose = jax.tree.map(lambda array: array * np.nan, random_pose(1))
-            return types.SimpleNamespace(
-                pose=pose, labels=np.zeros((1, 1024), np.int32), confidence=np.zeros((1, 2))
-            )
+            return prediction(points, pose)
 
-    monkeypatch.setattr(sys.modules["caper_jax.estimator"], "load", lambda *_: Lost())
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: Lost())
     assert run("--points", "cloud.npy", "--json", "pose.json") == 2
     assert "no finite pose" in capsys.readouterr().err and not os.path.exists("pose.json")

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from caper_jax.articulation.category import Category
     from caper_jax.articulation.pose import ArticulatedPose
     from caper_jax.data.cloud import Cloud
+    from caper_jax.estimator import Prediction
 
 FRAME = "camera, OpenCV: x right, y down, z forward; p_camera = rotation p + translation"
 NUM_POINTS = 1024
@@ -75,6 +76,8 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
+    import jax
+
     from caper_jax import categories
 
     category = categories.get(arguments.category)
@@ -85,8 +88,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     estimator = load(category.name, arguments.weights)
     prediction = estimator(observation.cloud.points[None])
-    pose = _first(prediction.pose)
-    confidence = np.asarray(prediction.confidence)[0]
+    prediction = jax.tree.map(lambda array: np.asarray(array)[0], prediction)
+    pose, confidence = prediction.pose, prediction.confidence
     if not all(np.isfinite(value).all() for value in vars(pose).values()):
         raise CaperError("the model gave no finite pose for this object; check mask and units")
 
@@ -96,14 +99,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"confidence {' '.join(f'{value:.2f}' for value in confidence)}; {cloud.available} points, "
         f"{cloud.dropped} dropped"
     )
+    if prediction.degenerate:
+        print("the rotation is arbitrary: the two directions that give it are parallel")
     if arguments.json is not None:
         from caper_jax.training.export import write_atomically
 
         text = json.dumps(_as_json(pose, category, cloud, confidence), indent=2, allow_nan=False)
         write_atomically(arguments.json, text.encode() + b"\n")
     if arguments.picture is not None or arguments.page is not None:
-        labels = np.asarray(prediction.labels)[0]
-        _draw(arguments, category, observation, pose, labels)
+        _draw(arguments, category, observation, prediction)
     return 0
 
 
@@ -160,12 +164,6 @@ def _observe(arguments: argparse.Namespace) -> _Observation:
         mask = mask_from_box(depth, intrinsics, arguments.box)
     cloud = cloud_from_depth(depth, mask, intrinsics, NUM_POINTS)
     return _Observation(cloud, depth, mask, intrinsics)
-
-
-def _first(pose: ArticulatedPose) -> ArticulatedPose:
-    import jax
-
-    return jax.tree.map(lambda array: np.asarray(array)[0], pose)
 
 
 def _format_pose(pose: ArticulatedPose, category: Category) -> str:
@@ -228,8 +226,7 @@ def _draw(
     arguments: argparse.Namespace,
     category: Category,
     observation: _Observation,
-    pose: ArticulatedPose,
-    labels: np.ndarray,
+    prediction: Prediction,
 ) -> None:
     from caper_jax.visualization.scene import Scene
 
@@ -238,9 +235,9 @@ def _draw(
     scene = Scene(
         name=source.name,
         category=category,
-        points=observation.cloud.points,
-        labels=labels,
-        pose=pose,
+        points=prediction.points,
+        labels=prediction.labels,
+        pose=prediction.pose,
         depth=None if depth is None else np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0),
         mask=observation.mask,
         intrinsics=observation.intrinsics,

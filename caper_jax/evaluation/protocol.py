@@ -160,9 +160,9 @@ def mean_predictor(category: Category, mean_pose: Mapping[str, Any], source: str
 
 
 def _cloud(frame: Frame, num_points: int) -> np.ndarray:
-    """[N, 3]; zeros for a frame that shows too little, whose estimate is not used."""
+    """[N, 3]; for a frame that shows too little, some cloud, whose estimate is not used."""
     if len(frame.points) < MIN_POINTS:
-        return np.zeros((num_points, 3), np.float32)
+        return np.linspace((-0.1, -0.1, 0.9), (0.1, 0.1, 1.1), num_points, dtype=np.float32)
     return sample_points(frame.points, num_points, where=frame.name).points
 
 
