@@ -126,7 +126,8 @@ def fit(
 
     The run directory holds config.json, metrics.jsonl and checkpoints/. A run bounded by steps
     ends with the same bits however often it was interrupted, on the same machine and software
-    (on GPUs only as far as the operations of the loss are deterministic).
+    (on GPUs only as far as the operations of the loss are deterministic). SIGTERM or Ctrl-C saves
+    and returns; of several processes, the signals and the clock of the first decide for all.
 
     Args:
       directory: the run directory.
@@ -237,6 +238,7 @@ class _Run:
                 self.metrics.flush(self.step, self.factor, self.elapsed())
             self.save()
             show()
+        self.checkpoints.wait()  # nobody should be told of a checkpoint that is not there yet
         if not finished:
             print(
                 f"stopped at step {self.step}; the same command resumes from {self.directory}",
