@@ -32,13 +32,7 @@ def load(path: str | Path, cls: type[T], *overrides: str) -> T:
     Raises:
       CaperError: the file cannot be read, or holds an unknown key or a wrong value.
     """
-    try:
-        with open(path, "rb") as file:
-            values = tomllib.load(file)
-    except OSError as error:
-        raise CaperError(f"cannot read configuration {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CaperError(f"{path} is not valid TOML: {error}") from error
+    values = _read_toml(path)
     for assignment in overrides:
         _assign(values, cls, assignment)
     return from_dict(cls, values, str(path))
@@ -62,6 +56,39 @@ def override(config: T, *assignments: str) -> T:
     for assignment in assignments:
         _assign(values, type(config), assignment)
     return from_dict(type(config), values, "override")
+
+
+def update(config: T, path: str | Path) -> T:
+    """A copy of a configuration with the values of a TOML file in the place of its own.
+
+    Args:
+      config: a dataclass.
+      path: TOML file; what it does not name stays as it is.
+
+    Raises:
+      CaperError: the file cannot be read, or holds an unknown key or a wrong value.
+    """
+    values = to_dict(config)
+    _merge(values, _read_toml(path))
+    return from_dict(type(config), values, str(path))
+
+
+def _merge(values: dict[str, Any], changes: dict[str, Any]) -> None:
+    for key, change in changes.items():
+        if isinstance(change, dict) and isinstance(values.get(key), dict):
+            _merge(values[key], change)
+        else:
+            values[key] = change
+
+
+def _read_toml(path: str | Path) -> dict[str, Any]:
+    try:
+        with open(path, "rb") as file:
+            return tomllib.load(file)
+    except OSError as error:
+        raise CaperError(f"cannot read configuration {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CaperError(f"{path} is not valid TOML: {error}") from error
 
 
 def from_dict(cls: type[T], values: dict[str, Any], where: str) -> T:

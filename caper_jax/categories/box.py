@@ -181,8 +181,8 @@ BOX = Category(
     directions=("x", "z"),
     directions_reason="the hinge line and the way from hinge to front show at any opening angle",
     unit=7.0,
-    mean_size=((0.23, 0.06, 0.11), (0.23, 0.025, 0.11)),
-    mean_center=((0.0, -0.005, 0.0), (0.0, 0.02, 0.0)),
+    mean_size=((0.227, 0.063, 0.118), (0.226, 0.027, 0.118)),
+    mean_center=((0.0, -0.006, -0.002), (0.0, 0.024, 0.002)),
     shape=shape,
     equivalences=(
         Equivalence(

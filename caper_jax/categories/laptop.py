@@ -126,8 +126,8 @@ LAPTOP = Category(
     directions=("y", "z"),
     directions_reason="mirror-symmetric in the y-z plane, so y and z are what the shape shows",
     unit=4.0,
-    mean_size=((0.33, 0.03, 0.23), (0.325, 0.225, 0.012)),
-    mean_center=((0.0, -0.11, 0.0), (0.0, 0.01, -0.11)),
+    mean_size=((0.331, 0.029, 0.236), (0.326, 0.227, 0.008)),
+    mean_center=((0.0, -0.11, 0.001), (0.0, 0.012, -0.112)),
     shape=shape,
     equivalences=(
         Equivalence(

@@ -27,6 +27,8 @@ class NetworkConfig:
       pooled_heads: decoders of stage II with one output per cloud (state, sizes).
       point_heads: decoders of stage II with one output per point (segmentation, joints).
       num_points: points per cloud that the networks see.
+      point_stride: in training the point-wise decoders see every so-manieth point only; they
+        treat points alike, so this costs gradients, not coverage.
     """
 
     encoder: Literal["hs", "fast"] = "fast"
@@ -36,6 +38,7 @@ class NetworkConfig:
     pooled_heads: HeadConfig = HeadConfig()
     point_heads: HeadConfig = HeadConfig()
     num_points: int = 1024
+    point_stride: int = 1
 
 
 def make_encoder(config: NetworkConfig) -> nn.Module:
@@ -118,15 +121,19 @@ class PartsNetwork(nn.Module):
 
     @nn.compact
     def __call__(self, points, train: bool) -> PartsOutput:
-        """points [B, N, 3], canonicalised, network units -> PartsOutput."""
+        """points [B, N, 3], canonicalised, network units -> PartsOutput.
+
+        In training N is divided by ``config.point_stride`` in the point-wise outputs.
+        """
         parts, joints = self.num_parts, self.num_parts - 1
-        batch, count = points.shape[:2]
+        batch = points.shape[0]
         # Not centred: where the origin lies is what stage I has found out.
         features = make_encoder(self.config)(points, train)
+        chosen = features.every(self.config.point_stride) if train else features
         pointwise = self.config.point_heads
-        segmentation = PointHead(parts, pointwise, name="segmentation")(features, train)
-        votes = PointHead(7 * joints, pointwise, name="joint")(features, train)
-        votes = votes.reshape(batch, count, joints, 7)
+        segmentation = PointHead(parts, pointwise, name="segmentation")(chosen, train)
+        votes = PointHead(7 * joints, pointwise, name="joint")(chosen, train)
+        votes = votes.reshape(batch, -1, joints, 7)
         pooled = self.config.pooled_heads
         state = PooledHead(joints, pooled, name="state")(features, train)
         extent = PooledHead(6 * parts, pooled, name="size")(features, train)

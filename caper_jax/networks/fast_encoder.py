@@ -15,7 +15,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from caper_jax.networks.features import Features, Level
-from caper_jax.networks.graph import nearest, squared_distances
+from caper_jax.networks.graph import nearest_row, squared_distances
 
 
 @dataclass(frozen=True)
@@ -107,5 +107,5 @@ class FastEncoder(nn.Module):
             mixed += nn.Dense(config.width, use_bias=False)(shared)[:, None, :]
             features += norm_relu(mixed)
         last = norm_relu(nn.Dense(config.last)(features))
-        level = Level(last, nearest(points, centers, 1)[..., 0])
+        level = Level(last, nearest_row(points, centers))
         return Features(points, (level,), last.max(axis=1) if config.global_feature else None)

@@ -38,6 +38,18 @@ class Features:
     levels: tuple[Level, ...]
     shared: Any = None
 
+    def every(self, stride: int) -> Features:
+        """The same features at every stride-th input point."""
+        if stride == 1:
+            return self
+        levels = tuple(
+            Level(level.features[:, ::stride])
+            if level.nearest is None
+            else Level(level.features, level.nearest[:, ::stride])
+            for level in self.levels
+        )
+        return Features(self.points[:, ::stride], levels, self.shared)
+
 
 class BlockDense(nn.Module):
     """A dense layer over the concatenation of all levels at every point, without building it.

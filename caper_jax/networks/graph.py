@@ -35,6 +35,11 @@ def nearest(query, points, k: int, exclude_self: bool = False):
     return lax.top_k(-distance, k)[1]
 
 
+def nearest_row(query, points):
+    """Index [B, N] of the nearest of ``points`` [B, M, C] to each ``query`` [B, N, C]."""
+    return squared_distances(lax.stop_gradient(query), lax.stop_gradient(points)).argmin(-1)
+
+
 def gather(features, index):
     """features [B, M, ...], index [B, ...] -> [B, ..., C] rows, per batch element."""
     return jax.vmap(lambda rows, at: rows.at[at].get(mode="promise_in_bounds"))(features, index)

@@ -14,6 +14,7 @@ from caper_jax.networks.graph import (
     directions,
     gather,
     nearest,
+    nearest_row,
     neighbour_max,
 )
 
@@ -158,8 +159,8 @@ class HSEncoder(nn.Module):
 
         levels = (
             Level(jnp.concatenate([f0, f1], -1)),
-            Level(jnp.concatenate([f2, f3], -1), nearest(points, points1, 1)[..., 0]),
-            Level(f4, nearest(points, points2, 1)[..., 0]),
+            Level(jnp.concatenate([f2, f3], -1), nearest_row(points, points1)),
+            Level(f4, nearest_row(points, points2)),
         )
         return Features(points, levels, f4.max(1) if config.global_feature else None)
 

@@ -13,6 +13,7 @@ PRESETS: dict[str, NetworkConfig] = {
         root_heads=HeadConfig(widths=(256, 256, 256), dropout=0.0, coarse=True),
         pooled_heads=HeadConfig(widths=(256, 256, 256), dropout=0.0, coarse=True),
         point_heads=HeadConfig(widths=(64, 64, 64), dropout=0.0),
+        point_stride=4,
     ),
 }
 

@@ -8,12 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from caper_jax.geometry.directions import rotation_from_directions
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.equivalence import is_ambiguous, second_labels, second_reading
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.geometry import so3
+from caper_jax.geometry.directions import rotation_from_directions
 from caper_jax.networks.canonical import canonicalise, multiply, rotate, view_rotation
 from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
 from caper_jax.networks.voting import vote
@@ -98,7 +98,10 @@ class Task:
         rotation, translation = self._noisy_root(keys[1], output, truth)
         canonical = canonicalise(points, rotation, translation)
         parts, parts_state = self._apply("parts", params, model_state, canonical, keys[2])
-        parts_losses, metrics = self._parts_losses(canonical, parts, truth, labels)
+        stride = self.network.point_stride
+        parts_losses, metrics = self._parts_losses(
+            canonical[:, ::stride], parts, truth, labels[:, ::stride]
+        )
 
         weights = self.config.weights
         total = losses.weighted_total(weights, root_losses).mean()

@@ -86,29 +86,26 @@ def _look_at(eye, target, up, roll):
 
 def _draw_camera(key, view: Viewpoint, diagonal):
     """World (root canonical) -> camera [4, 4], as conventions ask: see Viewpoint."""
-    keys = jax.random.split(key, 5)
+    # One draw for all: every call of jax.random costs compile time.
+    uniform = jax.random.uniform(key, (10,))
     low = jnp.radians(jnp.array([view.azimuth[0], view.elevation[0], -view.roll]))
     high = jnp.radians(jnp.array([view.azimuth[1], view.elevation[1], view.roll]))
-    azimuth, elevation, roll = jax.random.uniform(keys[0], (3,), minval=low, maxval=high)
+    azimuth, elevation, roll = low + uniform[:3] * (high - low)
     # Uniform in log distance: relative, as perspective is.
-    distance = diagonal * jnp.exp(
-        jax.random.uniform(
-            keys[1], (), minval=np.log(view.distance[0]), maxval=np.log(view.distance[1])
-        )
-    )
+    nearest, farthest = np.log(view.distance)
+    distance = diagonal * jnp.exp(nearest + uniform[3] * (farthest - nearest))
     level, height = jnp.cos(elevation), jnp.sin(elevation)
     around = jnp.array([jnp.sin(azimuth) * level, height, jnp.cos(azimuth) * level])
     # Canonical axes (x, y, z) cycle so that `up` comes second.
     shift = {"y": 0, "z": 1, "x": -1}[view.up]
     eye = jnp.roll(around, shift) * distance
     up = jnp.zeros(3).at["xyz".index(view.up)].set(1.0)
-    target = jax.random.uniform(keys[2], (3,), minval=-0.05, maxval=0.05) * diagonal
+    target = (uniform[4:7] - 0.5) * 0.1 * diagonal
     camera = _look_at(eye, target, up, roll)
     # The object stands anywhere in the image: turn the camera away from it, keeping its place.
     # 0.55 and 0.35 are the half widths of a 58 x 39 deg field of view at z = 1; wide cameras
     # reach 1.2 times that.
-    aside = jax.random.uniform(keys[3], (2,), minval=-1.0, maxval=1.0) * jnp.array([0.55, 0.35])
-    aside *= jax.random.uniform(keys[4], (), minval=0.0, maxval=1.2)
+    aside = (2.0 * uniform[7:9] - 1.0) * jnp.array([0.55, 0.35]) * 1.2 * uniform[9]
     # Keep the whole object in front of the camera at close range.
     aside *= jnp.minimum(1.0, distance / (3.0 * diagonal))
     return jnp.matmul(_aside(aside), camera, precision="highest")
@@ -144,35 +141,44 @@ def _systematic(key, hit, count: int):
 
 def _occluder(key, probability: float, grid: int):
     """[grid, grid] bool, False where something in front hides the object."""
-    keys = jax.random.split(key, 3)
-    angle = jax.random.uniform(keys[0], (), maxval=2 * jnp.pi)
-    edge = jax.random.uniform(keys[1], (), minval=0.1, maxval=0.9)
+    uniform = jax.random.uniform(key, (3,))
+    angle, edge = 2 * jnp.pi * uniform[0], 0.1 + 0.8 * uniform[1]
     axis = jnp.linspace(-1.0, 1.0, grid)
     side = jnp.cos(angle) * axis[None, :] + jnp.sin(angle) * axis[:, None]
-    return (side < edge) | (jax.random.uniform(keys[2]) >= probability)
+    return (side < edge) | (uniform[2] >= probability)
 
 
-def render_frame(key, instance: Bank, category: Category, config: GeneratorConfig, mix):
-    """One labelled frame of one instance (Bank without its leading axis); see ``Batch``."""
-    keys = jax.random.split(key, 9)
+def draw_state_and_poses(key, instance: Bank, category: Category):
+    """Joint states over the instance's range, and a camera around it.
+
+    Returns:
+      state [J], part poses [K, 4, 4] rest frame -> camera, and the diagonal at rest, metres.
+    """
+    state_key, camera_key = jax.random.split(key)
     low, high = instance.limits[:, 0], instance.limits[:, 1]
-    state = low + jax.random.uniform(keys[0], low.shape) * (high - low)
+    state = low + jax.random.uniform(state_key, low.shape) * (high - low)
     box_low = (instance.box_center - instance.size / 2).min(0)
     box_high = (instance.box_center + instance.size / 2).max(0)
     diagonal = jnp.linalg.norm(box_high - box_low)
-    root = _draw_camera(keys[1], category.viewpoint, diagonal)
     poses = forward_kinematics(
-        root,
+        _draw_camera(camera_key, category.viewpoint, diagonal),
         instance.joint_axis,
         instance.joint_pivot,
         state,
         category.joint_types,
         category.parents,
     )
+    return state, poses, diagonal
+
+
+def render_frame(key, instance: Bank, category: Category, config: GeneratorConfig, mix):
+    """One labelled frame of one instance (Bank without its leading axis); see ``Batch``."""
+    keys = jax.random.split(key, 8)
+    state, poses, diagonal = draw_state_and_poses(keys[0], instance, category)
 
     low2, high2 = projected_bounds(instance.groups, poses)
     steps = jnp.arange(config.grid) + 0.0
-    offset = jax.random.uniform(keys[2], (2,))
+    offset = jax.random.uniform(keys[1], (2,))
     x = low2[0] + (steps + offset[0]) / config.grid * (high2[0] - low2[0])
     y = low2[1] + (steps + offset[1]) / config.grid * (high2[1] - low2[1])
     x, y = jnp.meshgrid(x, y, indexing="xy")
@@ -180,17 +186,17 @@ def render_frame(key, instance: Bank, category: Category, config: GeneratorConfi
     depth, part = depth.reshape(x.shape), part.reshape(x.shape)
     hit = part >= 0
     if config.occlusion > 0:
-        kept = hit & _occluder(keys[3], config.occlusion, config.grid)
+        kept = hit & _occluder(keys[2], config.occlusion, config.grid)
         hit = jnp.where(kept.sum() > 0.3 * hit.sum(), kept, hit)
-    sensor = sensors.draw(keys[4], mix)
+    sensor = sensors.draw(keys[3], mix)
     surface = sensors.surface(depth, hit, (x, y))
-    seen = sensors.lose(keys[5], sensor, surface, hit)
+    seen = sensors.lose(keys[4], sensor, surface, hit)
     seen = jnp.where(seen.any(), seen, hit)
 
     # Only the chosen pixels are measured: random numbers are what costs on a CPU.
-    index = _systematic(keys[6], seen.ravel(), config.num_points)
+    index = _systematic(keys[5], seen.ravel(), config.num_points)
     chosen = jax.tree.map(lambda image: image.ravel()[index], surface)
-    points = sensors.measure(keys[8], sensor, chosen, (x.ravel()[index], y.ravel()[index]))
+    points = sensors.measure(keys[6], sensor, chosen, (x.ravel()[index], y.ravel()[index]))
     labels = part.ravel()[index]
     if config.residue > 0:
         points, labels = _add_residue(keys[7], points, labels, diagonal, config.residue)
@@ -209,10 +215,10 @@ def render_frame(key, instance: Bank, category: Category, config: GeneratorConfi
 
 def _add_residue(key, points, labels, diagonal, largest: float):
     """Pushes a few points along their rays, as pixels that see past the object."""
-    keys = jax.random.split(key, 3)
-    fraction = jax.random.uniform(keys[0], maxval=largest)
-    chosen = jax.random.uniform(keys[1], labels.shape) < fraction
-    push = jax.random.exponential(keys[2], labels.shape) * 0.2 * diagonal
+    count = labels.shape[0]
+    uniform = jax.random.uniform(key, (2 * count + 1,), minval=1e-7)
+    chosen = uniform[:count] < uniform[-1] * largest
+    push = -jnp.log(uniform[count:-1]) * 0.2 * diagonal
     factor = 1.0 + jnp.where(chosen, push / jnp.linalg.norm(points, axis=-1), 0.0)
     return points * factor[:, None], jnp.where(chosen, -1, labels)
 

@@ -134,16 +134,16 @@ def lose(key, sensor: Sensor, surface: Surface, hit):
 
 def measure(key, sensor: Sensor, surface: Surface, rays):
     """Measured points [..., 3], metres, camera frame, for pixels of any shape [...]."""
-    keys = jax.random.split(key, 3)
+    normal_key, uniform_key = jax.random.split(key)
     x, y = rays
     depth = surface.depth
     angle = jnp.arccos(surface.cosine)
     grazing = (angle / (jnp.pi / 2 - angle)) ** 2 * 1e-4 / jnp.sqrt(jnp.maximum(depth, 0.1))
     sigma = sensor.floor + sensor.quadratic * (depth - 0.4) ** 2 + sensor.incidence * grazing
-    normal = jax.random.normal(keys[0], (4, *depth.shape))
+    normal = jax.random.normal(normal_key, (4, *depth.shape))
     z = depth + sigma * normal[0]
     # Mixed pixels lie part of the way to the surface behind.
-    uniform = jax.random.uniform(keys[1], (2, *depth.shape))
+    uniform = jax.random.uniform(uniform_key, (2, *depth.shape))
     mixed = (uniform[0] < sensor.mixing) & surface.jump
     z = jnp.where(mixed, z + uniform[1] * surface.reach, z)
     focal_baseline = jnp.maximum(sensor.focal_baseline, 1e-6)

@@ -1,0 +1,76 @@
+"""``caper train``: trains a category's networks on generated data, or resumes a run."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from caper_jax.cli import common
+from caper_jax.errors import CaperError
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = common.create_parser(
+        "train",
+        "Trains both stages of a category on endless generated data. The same command resumes a\n"
+        "run that was stopped or killed. Writes metrics.jsonl and checkpoints, and at the end a\n"
+        "model (weights.npz, model.json) for --weights of the other commands.",
+        [
+            ("--category box --minutes 30 --out runs/box", "the fast preset, half an hour"),
+            ("--category box --config configs/fast.toml --minutes 30 --out runs/box", ""),
+            ("--category laptop --preset paper --steps 1000 --out runs/paper", ""),
+            ("--category box --set training.learning_rate=1e-3 --steps 500 --out runs/try", ""),
+        ],
+    )
+    parser.add_argument("--category", required=True, help="e.g. box")
+    parser.add_argument("--preset", default="fast", help="fast or paper (default: fast)")
+    parser.add_argument("--config", type=Path, help="TOML file of settings over the preset's")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="overrides",
+        help="one setting, e.g. training.batch_size=8; may be repeated",
+    )
+    budget = parser.add_mutually_exclusive_group()
+    budget.add_argument("--minutes", type=float, help="length of the run in minutes")
+    budget.add_argument(
+        "--steps", type=common.positive_int, help="length in steps: reproducible to the bit"
+    )
+    parser.add_argument("--seed", type=int, help="of shapes, frames and weights (default: 0)")
+    parser.add_argument("--out", required=True, type=Path, help="folder of the run")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
+    common.check_folder(arguments.out, "--out")
+    from caper_jax.configuration import override, update
+    from caper_jax.training import run
+
+    config = run.preset(arguments.preset, arguments.category)
+    if arguments.config is not None:
+        config = update(config, arguments.config)
+    config = override(config, *arguments.overrides)
+    budget = {"minutes": arguments.minutes, "steps": arguments.steps}
+    if any(value is not None for value in budget.values()):
+        config = dataclasses.replace(
+            config, training=dataclasses.replace(config.training, **budget)
+        )
+    if arguments.seed is not None:
+        if arguments.seed < 0:
+            raise CaperError(f"--seed must not be negative, got {arguments.seed}")
+        training = dataclasses.replace(config.training, seed=arguments.seed)
+        config = dataclasses.replace(config, training=training)
+    result = run.train(config, arguments.out)
+    steps = int(result.state.step)
+    if not result.finished:
+        print(f"stopped at step {steps}; the same command goes on from there")
+        return common.EXIT_INTERRUPTED
+    print(f"trained {steps} steps; model written to {arguments.out}")
+    return 0

@@ -1,0 +1,133 @@
+"""Whole depth images of generated objects on a table, as a camera would give them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from caper_jax.articulation.category import Category
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.data.synthetic import sensor as sensors
+from caper_jax.data.synthetic.bank import Bank
+from caper_jax.data.synthetic.caster import FAR, cast, projected_bounds
+from caper_jax.data.synthetic.scene import draw_state_and_poses
+
+
+@dataclass(frozen=True)
+class Image:
+    """One rendered frame.
+
+    Attributes:
+      depth: [H, W] float32 metres, 0 where the sensor returns nothing.
+      parts: [H, W] int32 part of each pixel, -1 off the object.
+      intrinsics: [3, 3] pixels.
+      pose: ArticulatedPose (numpy, no batch axis).
+    """
+
+    depth: np.ndarray
+    parts: np.ndarray
+    intrinsics: np.ndarray
+    pose: ArticulatedPose
+
+
+def render_image(
+    key, instance: Bank, category: Category, noise: str, width: int = 640, height: int = 480
+) -> Image:
+    """One instance on a table, drawn as in ``scene`` and seen whole by a pinhole camera.
+
+    Args:
+      key: PRNG key.
+      instance: Bank without its leading axis.
+      category: its category.
+      noise: sensor preset.
+      width, height: pixels.
+
+    Raises:
+      CaperError: unknown noise preset.
+    """
+    sensor = jax.tree.map(lambda values: values[0], sensors.sensor_mix((noise,)))
+    draw = jax.jit(partial(_render, category=category, width=width, height=height))
+    depth, parts, intrinsics, pose = draw(key, instance, sensor)
+    pose = jax.tree.map(np.asarray, pose)
+    return Image(np.asarray(depth), np.asarray(parts), np.asarray(intrinsics, np.float64), pose)
+
+
+def _render(key, instance: Bank, sensor, category: Category, width: int, height: int):
+    keys = jax.random.split(key, 4)
+    state, poses, _ = draw_state_and_poses(keys[0], instance, category)
+    # A focal length between those of wide and narrow depth cameras, shortened until the object
+    # is in the image with a margin.
+    low, high = projected_bounds(instance.groups, poses)
+    reach = jnp.maximum(jnp.abs(low), jnp.abs(high)) / jnp.array([width, height])
+    focal = jax.random.uniform(keys[1], minval=0.85, maxval=1.25) * width
+    focal = jnp.minimum(focal, 0.46 / reach.max())
+    center = jnp.array([width, height]) / 2 + jax.random.uniform(
+        keys[2], (2,), minval=-0.01, maxval=0.01
+    ) * jnp.array([width, height])
+    x = (jnp.arange(width) - center[0]) / focal
+    y = (jnp.arange(height) - center[1]) / focal
+    x, y = jnp.meshgrid(x, y, indexing="xy")
+    depth, parts = cast(instance.groups, poses, (x.ravel(), y.ravel()))
+    depth, parts = depth.reshape(x.shape), parts.reshape(x.shape)
+    # The table: the plane through the lowest point of the root, across the axis that points up.
+    up = "xyz".index(category.viewpoint.up)
+    rotation, translation = poses[0, :3, :3], poses[0, :3, 3]
+    normal = rotation[:, up]
+    lowest = instance.box_center[0, up] - instance.size[0, up] / 2
+    along = normal[0] * x + normal[1] * y + normal[2]
+    table = ((normal * translation).sum() + lowest) / jnp.where(along < -1e-6, along, -1e-6)
+    table = jnp.where((table > 0) & (table < 6.0), table, FAR)
+    on_table = table < depth
+    depth, parts = jnp.where(on_table, table, depth), jnp.where(on_table, -1, parts)
+
+    hit = depth < FAR
+    surface = sensors.surface(depth, hit, (x, y))
+    noise_key, loss_key = jax.random.split(keys[3])
+    seen = sensors.lose(loss_key, sensor, surface, hit)
+    measured = sensors.measure(noise_key, sensor, surface, (x, y))[..., 2]
+    intrinsics = jnp.array([[focal, 0.0, center[0]], [0.0, focal, center[1]], [0.0, 0.0, 1.0]])
+    pose = ArticulatedPose(
+        rotation=poses[:, :3, :3],
+        translation=poses[:, :3, 3],
+        size=instance.size,
+        box_center=instance.box_center,
+        joint_axis=instance.joint_axis,
+        joint_pivot=instance.joint_pivot,
+        joint_state=state,
+    )
+    return jnp.where(seen, measured, 0.0), jnp.where(seen, parts, -1), intrinsics, pose
+
+
+def write_frame(folder: str | Path, image: Image, category: Category, name: str) -> None:
+    """Writes one frame as the commands read it.
+
+    depth.png (16 bit, millimetres), mask.png (255 on the object), intrinsics.json and truth.json
+    (the fields of ArticulatedPose; metres and radians).
+    """
+    from PIL import Image as Picture
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    millimetres = np.clip(np.round(image.depth * 1000), 0, 65535).astype(np.uint16)
+    Picture.fromarray(millimetres).save(folder / "depth.png")
+    mask = np.where(image.parts >= 0, 255, 0).astype(np.uint8)
+    Picture.fromarray(mask).save(folder / "mask.png")
+    height, width = image.depth.shape
+    camera = {
+        "width": width,
+        "height": height,
+        # Open3D's layout: column-major.
+        "intrinsic_matrix": [round(float(v), 6) for v in image.intrinsics.T.ravel()],
+    }
+    truth: dict[str, Any] = {"category": category.name, "frame": name}
+    for field, values in vars(image.pose).items():
+        truth[field] = np.round(np.asarray(values, np.float64), 9).tolist()
+    for file, content in (("intrinsics.json", camera), ("truth.json", truth)):
+        (folder / file).write_text(json.dumps(content, indent=1) + "\n")

@@ -1,0 +1,244 @@
+"""Single-frame estimation: points -> root pose -> canonical cloud -> joints -> parts (Sec 5)."""
+
+from __future__ import annotations
+
+from functools import partial
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from caper_jax import categories
+from caper_jax.articulation.category import Category
+from caper_jax.articulation.kinematics import forward_kinematics
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.configuration import from_dict
+from caper_jax.data.cloud import sample_points
+from caper_jax.errors import CaperError
+from caper_jax.geometry import se3
+from caper_jax.geometry.directions import rotation_from_directions
+from caper_jax.networks.canonical import (
+    canonicalise,
+    multiply,
+    rotate,
+    transpose,
+    view_rotation,
+)
+from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
+from caper_jax.networks.voting import vote
+from caper_jax.training.export import read_model
+
+# Part sizes are residuals to a mean; nothing keeps a regression from going below zero.
+_SMALLEST_SIZE = 1e-4
+
+
+@flax.struct.dataclass
+class Prediction:
+    """What the estimator finds; leading axes [...] are those of its input.
+
+    Attributes:
+      pose: ArticulatedPose in the camera frame, metres.
+      points: [..., M, 3] the points the networks saw: the input itself when it has as many points
+        as they take, else an even pick of it.
+      labels: [..., M] int32 part of each of ``points``.
+      confidence: [..., 2] of the root's two directions, in (0, 1) (Sec 5.1.1).
+      degenerate: [...] bool, the two directions were parallel or zero: the rotation is arbitrary.
+    """
+
+    pose: ArticulatedPose
+    points: Any
+    labels: Any
+    confidence: Any
+    degenerate: Any
+
+
+def estimate(
+    variables: dict[str, Any], points, category: Category, network: NetworkConfig
+) -> Prediction:
+    """The pure function under the estimator: jit, vmap and differentiate it at will.
+
+    Differentiable with respect to ``variables`` and ``points`` (labels and the choice of
+    neighbours are not). vmap over stacked variables runs several models on one cloud.
+
+    Args:
+      variables: {"params": {"root", "parts"}, "batch_stats": {...}} as trained.
+      points: [B, N, 3] metres, camera frame, finite.
+      category: static.
+      network: static.
+
+    Returns:
+      Prediction with leading axis B and M = N.
+    """
+
+    def apply(stage, module, cloud):
+        own = {name: collection[stage] for name, collection in variables.items()}
+        return module.apply(own, cloud, train=False)
+
+    unit = category.unit
+    view = view_rotation(points)
+    cloud = rotate(view, points) * unit
+    root = apply("root", RootNetwork(network), cloud)
+    rotation, degenerate = rotation_from_directions(
+        root.directions[:, 0],
+        root.directions[:, 1],
+        root.confidence[:, 0],
+        root.confidence[:, 1],
+        category.directions,
+    )
+
+    canonical = canonicalise(cloud, rotation, root.translation)
+    parts = apply("parts", PartsNetwork(network, category.num_parts), canonical)
+    axis, pivot = vote(canonical, parts.heatmap, parts.offset, parts.direction)
+    length = jnp.array([1 / unit if kind == "prismatic" else 1.0 for kind in category.joint_types])
+    state, pivot = parts.state * length, pivot / unit
+
+    back = transpose(view)
+    translation = rotate(back, root.translation[:, None])[:, 0] / unit
+    poses = forward_kinematics(
+        se3.from_rt(multiply(back, rotation), translation),
+        axis,
+        pivot,
+        state,
+        category.joint_types,
+        category.parents,
+    )
+    size = jnp.asarray(category.mean_size) + parts.size / unit
+    pose = ArticulatedPose(
+        rotation=poses[..., :3, :3],
+        translation=poses[..., :3, 3],
+        size=jnp.maximum(size, _SMALLEST_SIZE),
+        box_center=jnp.asarray(category.mean_center) + parts.center / unit,
+        joint_axis=axis,
+        joint_pivot=pivot,
+        joint_state=state,
+    )
+    labels = parts.segmentation.argmax(-1).astype(jnp.int32)
+    return Prediction(pose, points, labels, root.confidence, degenerate)
+
+
+class Estimator:
+    """A trained model of one category.
+
+    Attributes:
+      category: its definition.
+      network: sizes of the networks.
+      variables: weights, as ``estimate`` takes them.
+      card: what the model was trained on, where and for how long.
+    """
+
+    def __init__(
+        self,
+        category: Category,
+        network: NetworkConfig,
+        variables: dict[str, Any],
+        card: dict[str, Any] | None = None,
+    ) -> None:
+        self.category = category
+        self.network = network
+        self.variables = jax.tree.map(jnp.asarray, variables)
+        self.card = card or {}
+        self.function = partial(estimate, category=category, network=network)
+        self._jitted = jax.jit(self.function)
+
+    def __call__(self, points) -> Prediction:
+        """Estimates one cloud or a batch.
+
+        Outside of transformations any number of points is taken: clouds are sampled to what the
+        networks see, so that a varying number never recompiles, and points that are NaN, infinite
+        or exactly zero are left out. Inside jit, grad or vmap the array goes through unchanged.
+
+        Args:
+          points: [N, 3] or [B, N, 3] metres, camera frame (OpenCV); in raster order if they come
+            from an image.
+
+        Returns:
+          Prediction with the leading axes of ``points``.
+
+        Raises:
+          CaperError: wrong shape or dtype, fewer than 16 usable points, or points in millimetres.
+        """
+        single = np.ndim(points) == 2
+        if isinstance(points, jax.core.Tracer):
+            batch = points[None] if single else points
+            prediction = self.function(self.variables, batch)
+        else:
+            batch = self._sampled(points)
+            prediction = self._jitted(self.variables, batch)
+        return jax.tree.map(lambda array: array[0], prediction) if single else prediction
+
+    def _sampled(self, points) -> np.ndarray:
+        """[B, num_points, 3] float32 from clouds of any size."""
+        clouds = np.asarray(points)
+        if clouds.ndim not in (2, 3) or clouds.shape[-1] != 3:
+            raise CaperError(f"points must be [N, 3] or [B, N, 3], got shape {clouds.shape}")
+        clouds = clouds[None] if clouds.ndim == 2 else clouds
+        if not len(clouds):
+            raise CaperError("points holds no cloud: its batch axis is empty")
+        count = self.network.num_points
+        return np.stack(
+            [
+                sample_points(
+                    cloud, count, where=f"points[{i}]" if len(clouds) > 1 else "points"
+                ).points
+                for i, cloud in enumerate(clouds)
+            ]
+        )
+
+
+def shipped_weights() -> Path:
+    """The folder of the models in the package, one folder per category."""
+    return Path(str(resources.files("caper_jax"))) / "assets" / "weights"
+
+
+def load(category: str, weights: str | Path | None = None) -> Estimator:
+    """The estimator of a category.
+
+    Args:
+      category: e.g. "box".
+      weights: a model directory (weights.npz, model.json) as training writes it; by default the
+        one that ships with the package.
+
+    Raises:
+      CaperError: unknown category, no model of it in the package, a damaged model, or one of
+        another category.
+
+    Example:
+      estimator = load("box")
+      prediction = estimator(points)   # points [B, N, 3]
+      prediction.pose.rotation         # [B, 2, 3, 3]
+    """
+    definition = categories.get(category)
+    directory = shipped_weights() / category if weights is None else Path(weights)
+    if weights is None and not directory.is_dir():
+        shipped = sorted(path.name for path in shipped_weights().glob("*/"))
+        raise CaperError(
+            f"no weights for {category!r} ship with the package (there are some for "
+            f"{', '.join(shipped) or 'no category'}); train some and pass their folder as weights"
+        )
+    card, variables = read_model(directory)
+    if card.get("category") != category:
+        raise CaperError(f"{directory} holds a model of {card.get('category')!r}, not {category!r}")
+    try:
+        sizes = card["run"]["network"]
+    except (KeyError, TypeError) as error:
+        raise CaperError(f"{directory / 'model.json'} lacks run.network; train again") from error
+    network = from_dict(NetworkConfig, sizes, str(directory / "model.json"))
+    _check_variables(directory, variables, definition, network)
+    return Estimator(definition, network, variables, card)
+
+
+def _check_variables(directory: Path, variables, category: Category, network: NetworkConfig):
+    """Raises CaperError unless the weights fit the networks of the card."""
+    points = jax.ShapeDtypeStruct((1, network.num_points, 3), jnp.float32)
+    function = partial(estimate, category=category, network=network)
+    try:
+        jax.eval_shape(function, variables, points)
+    except Exception as error:  # Flax raises many kinds; all mean that the two do not fit
+        reason = str(error).strip().splitlines()[0]
+        raise CaperError(
+            f"{directory}: weights.npz does not fit the network in model.json ({reason})"
+        ) from error
