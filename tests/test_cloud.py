@@ -57,6 +57,28 @@ def test_every_point_is_picked_equally_often():
     assert not np.array_equal(systematic_indices(9999, 64, 0), systematic_indices(9999, 64, 1))
 
 
+@pytest.mark.parametrize("width", [360, 384, 500])
+def test_picks_cover_a_large_object_evenly(width):
+    """Over 256 rows, 1024 even picks of the plain raster all fall on four columns."""
+    depth = np.ones((320, 640), np.float32)
+    mask = np.zeros(depth.shape, bool)
+    mask[10:266, 40 : 40 + width] = True
+    cloud = cloud_from_depth(depth, mask, K, num_points=1024)
+    assert cloud.available == 256 * width
+    assert len(np.unique(cloud.index)) == 1024
+    counts, _, _ = np.histogram2d(
+        *cloud.pixels.T, bins=(16, 16), range=((10, 266), (40, 40 + width))
+    )
+    assert counts.min() >= 2 and counts.max() <= 6
+
+
+def test_thin_objects_keep_enough_pixels():
+    depth = np.ones((600, 600), np.float32)
+    mask = np.eye(600, dtype=bool) | np.eye(600, k=1, dtype=bool)
+    cloud = cloud_from_depth(depth, mask, K, num_points=1024)
+    assert len(np.unique(cloud.index)) == 1024
+
+
 def test_small_objects_are_filled_up_by_repeating():
     mask = np.zeros(SHAPE, bool)
     mask[50:55, 60:65] = True

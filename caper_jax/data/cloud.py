@@ -11,6 +11,8 @@ from caper_jax.data.images import read_array
 from caper_jax.errors import CaperError
 
 MIN_POINTS = 16
+# Lines per side over the object's box: the generator casts its rays on such a grid.
+GRID = 96
 # Beyond this depth (metres) a cloud is taken for one in millimetres.
 _FARTHEST_M = 50.0
 
@@ -60,6 +62,9 @@ def cloud_from_depth(
 ) -> Cloud:
     """Back-projects the masked pixels and picks ``num_points`` of them in raster order.
 
+    Large objects are first thinned to a grid of rows and columns: an even pick along the raster
+    of a full image would fall on few columns wherever its stride fits the width of the object.
+
     Args:
       depth: [H, W] metres; zero, NaN and infinity are dropped and counted.
       mask: [H, W], nonzero on the object.
@@ -100,7 +105,8 @@ def cloud_from_depth(
     points = back_project(rows, columns, z, intrinsics)
     kept = np.arange(len(points)) if radius is None else _near(points, radius)
     _check_count(len(kept), f"of {len(valid)} masked pixels")
-    picked = kept[systematic_indices(len(kept), num_points, seed)]
+    lattice = kept[_on_grid(rows[kept], columns[kept], num_points)]
+    picked = lattice[systematic_indices(len(lattice), num_points, seed)]
     pixels = np.stack([rows[picked], columns[picked]], axis=-1)
     return Cloud(
         points=points[picked],
@@ -109,6 +115,25 @@ def cloud_from_depth(
         available=len(kept),
         dropped=len(valid) - len(kept),
     )
+
+
+def _on_grid(rows: np.ndarray, columns: np.ndarray, wanted: int) -> np.ndarray:
+    """Indices of the pixels on evenly spread rows and columns: at least ``wanted``, or all."""
+    lines = GRID
+    while True:
+        chosen = np.flatnonzero(_on_lines(rows, lines) & _on_lines(columns, lines))
+        if len(chosen) >= min(wanted, len(rows)):
+            return chosen
+        lines *= 2
+
+
+def _on_lines(positions: np.ndarray, lines: int) -> np.ndarray:
+    """[N] bool: the position is one of ``lines`` evenly spread ones (of all, if fewer)."""
+    offsets = positions - positions.min()
+    extent = int(offsets.max()) + 1
+    used = np.zeros(extent, bool)
+    used[((np.arange(lines) + 0.5) * extent / lines).astype(np.int64)] = True
+    return used[offsets]
 
 
 def back_project(
