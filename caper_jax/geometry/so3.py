@@ -177,12 +177,15 @@ def trigonometry(w: jax.Array) -> Trigonometry:
 def exp_coefficients(terms: Trigonometry) -> tuple[jax.Array, jax.Array, jax.Array]:
     """sin t / t, (1 - cos t) / t^2 and (t - sin t) / t^3, each [...]."""
     small, _, t, squared, sin, cos = terms
-    closed = sin / t, (1 - cos) / squared, (t - sin) / (squared * t)
-    series = [
-        alternating_series(lambda k, n=n: 1 / math.factorial(2 * k + n), terms) for n in (1, 2, 3)
-    ]
-    first, second, third = (jnp.where(small, s, c) for s, c in zip(series, closed, strict=True))
-    return first, second, third
+
+    def series(n: int) -> jax.Array:
+        return alternating_series(lambda k: 1 / math.factorial(2 * k + n), terms)
+
+    return (
+        jnp.where(small, series(1), sin / t),
+        jnp.where(small, series(2), (1 - cos) / squared),
+        jnp.where(small, series(3), (t - sin) / (squared * t)),
+    )
 
 
 def inverse_coefficients(terms: Trigonometry) -> tuple[jax.Array, jax.Array]:
@@ -259,11 +262,12 @@ def _quaternion(r: jax.Array) -> jax.Array:
         (wy, xy, diagonal[2], yz),
         (wz, xz, yz, diagonal[3]),
     )
-    best, column = diagonal[0], rows[0]
+    best = diagonal[0]
+    column = list(rows[0])
     for d, row in zip(diagonal[1:], rows[1:], strict=True):
         better = d > best
         best = jnp.where(better, d, best)
-        column = tuple(jnp.where(better, new, old) for new, old in zip(row, column, strict=True))
+        column = [jnp.where(better, new, old) for new, old in zip(row, column, strict=True)]
     q = jnp.stack(column, axis=-1)
     return jnp.where(q[..., :1] < 0, -q, q)
 
