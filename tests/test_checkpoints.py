@@ -46,12 +46,18 @@ def saved(tmp_path) -> Path:
     return tmp_path / "c"
 
 
-def test_what_changes_after_save_is_not_in_the_checkpoint(tmp_path):
+def test_what_changes_after_save_is_not_in_the_checkpoint(tmp_path, monkeypatch):
     """Orbax writes in the background: a sum that grows meanwhile must not leak into the file."""
     state, extra = make_state(1), {"sums": {"loss": 1.0}}
     with Checkpoints(tmp_path) as checkpoints:
+        save = checkpoints._manager.save
+
+        def late_save(*args, **kwargs):
+            extra["sums"]["loss"] = 2.0
+            return save(*args, **kwargs)
+
+        monkeypatch.setattr(checkpoints._manager, "save", late_save)
         checkpoints.save(1, state, extra)
-        extra["sums"]["loss"] = 2.0
         jax.jit(lambda s: jax.tree.map(lambda x: x * 0, s), donate_argnums=0)(state)
     with Checkpoints(tmp_path) as checkpoints:
         restored, extra = checkpoints.restore(make_state(0))
