@@ -12,10 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 
 from caper_jax.networks.features import Features, Level
-from caper_jax.networks.graph import nearest_row, squared_distances
+from caper_jax.networks.graph import squared_distances
 
 
 @dataclass(frozen=True)
@@ -107,5 +108,8 @@ class FastEncoder(nn.Module):
             mixed += nn.Dense(config.width, use_bias=False)(shared)[:, None, :]
             features += norm_relu(mixed)
         last = norm_relu(nn.Dense(config.last)(features))
-        level = Level(last, nearest_row(points, centers))
+        # Interpolation, not the nearest centre: smooth in the points, and a matrix product.
+        window = radius * config.scales[0]
+        closeness = -squared_distances(points, centers) / (2.0 * window * window)[:, None, None]
+        level = Level(last, jax.nn.softmax(closeness))
         return Features(points, (level,), last.max(axis=1) if config.global_feature else None)

@@ -6,6 +6,7 @@ from typing import Any
 
 import flax.linen as nn
 import flax.struct
+import jax.numpy as jnp
 
 from caper_jax.networks.graph import gather
 
@@ -16,12 +17,20 @@ class Level:
 
     Attributes:
       features: [B, M, C].
-      nearest: [B, N] row of ``features`` nearest to each input point; None when M == N and the
-        rows are the points themselves.
+      upsample: how rows come back to the N input points: [B, N] the row nearest to each point,
+        or [B, N, M] weights that sum to one; None when the rows are the points themselves.
     """
 
     features: Any
-    nearest: Any = None
+    upsample: Any = None
+
+    def at_points(self, values):
+        """Rows [B, M, C] brought to the input points, [B, N, C]."""
+        if self.upsample is None:
+            return values
+        if self.upsample.ndim == 3:
+            return jnp.einsum("bnm,bmc->bnc", self.upsample, values)
+        return gather(values, self.upsample)
 
 
 @flax.struct.dataclass
@@ -44,8 +53,8 @@ class Features:
             return self
         levels = tuple(
             Level(level.features[:, ::stride])
-            if level.nearest is None
-            else Level(level.features, level.nearest[:, ::stride])
+            if level.upsample is None
+            else Level(level.features, level.upsample[:, ::stride])
             for level in self.levels
         )
         return Features(self.points[:, ::stride], levels, self.shared)
@@ -73,7 +82,7 @@ class BlockDense(nn.Module):
         for number, level in enumerate(features.levels):
             bias = number == 0
             part = nn.Dense(self.width, use_bias=bias, name=f"level{number}")(level.features)
-            total += part if level.nearest is None else gather(part, level.nearest)
+            total += level.at_points(part)
         if self.with_points:
             total += nn.Dense(self.width, use_bias=False, name="points")(features.points)
         if features.shared is not None:

@@ -10,8 +10,8 @@ PRESETS: dict[str, NetworkConfig] = {
     "paper": NetworkConfig(encoder="hs"),
     "fast": NetworkConfig(
         encoder="fast",
-        root_heads=HeadConfig(widths=(256, 256, 256), dropout=0.0, coarse=True),
-        pooled_heads=HeadConfig(widths=(256, 256, 256), dropout=0.0, coarse=True),
+        root_heads=HeadConfig(widths=(256, 256, 256), dropout=0.0, pool_first=True),
+        pooled_heads=HeadConfig(widths=(256, 256, 256), dropout=0.0, pool_first=True),
         point_heads=HeadConfig(widths=(64, 64, 64), dropout=0.0),
         point_stride=4,
     ),
