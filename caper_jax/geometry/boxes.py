@@ -17,10 +17,12 @@ the same number, up to sign, for both sides: on plane i,
 
     n_k . x <= b_k    is    (n_k - n_i) . x <= b_k - b_i,
 
-on plane k the reverse; whatever rounding does, the two faces complement each other. Lines within a
+on plane k the reverse; whatever rounding does, the two faces complement each other. (Of planes
+facing each other it is the sum, the same for both.) Lines within a
 face are held by the angle of their normal and their distance, for the same reason: sin(f_k - f_j)
 changes sign with the order, to the last bit and however a compiler contracts sums of products.
-Only exact ties are left, and go to the plane with the lower index. There is no tolerance to choose.
+Only exact ties are left: of planes facing the same way the one with the lower index stands, between
+planes facing each other nothing is left. There is no tolerance to choose.
 
 Derivatives use the geometry, not the arithmetic: moving plane i sweeps its face, so
 dV = sum_i A_i db_i - (A_i c_i) . dn_i with c_i the centroid of face i.
@@ -44,9 +46,8 @@ _SIGN = np.array([1.0, -1.0])
 # Planes that can cut face i: all but itself and the opposite face of its own box.
 _CUTS = (_INDEX[:, None] // 2) != (_INDEX[None, :] // 2)
 _FIRST = _INDEX[:, None] < _INDEX[None, :]
-# Metres, beside lengths of 1e-4 to 1e3: nothing as a shift of a line (1e-18 over a steepness of
-# 1e-9), and with no steepness at all a distance of 1e7.
-_TIE, _LEAST_STEEPNESS = 1e-18, 1e-25
+# How far out (metres) a line stands for a plane that never cuts a face, or leaves none of it.
+_FAR = 1e6
 
 
 def corners(
@@ -195,14 +196,20 @@ def _faces(
     reach = jnp.repeat(halves.reshape(*batch, 6), 2, axis=-1)
     middles = jnp.repeat(origins, 6, axis=-2) + reach[..., None] * normals
 
-    # On plane i, plane k leaves the half-plane  across . y <= room.  [..., i, k, (2)]
-    difference = normals[..., None, :, :] - normals[..., :, None, :]
+    # On plane i, plane k leaves the half-plane  across . y <= room.  [..., i, k, (3)]
+    # 1 for planes facing the same way, -1 for the opposite, 0 for those well apart.
+    sign = jnp.round(jnp.sum(normals[..., None, :, :] * normals[..., :, None, :], axis=-1))
+    difference = normals[..., None, :, :] - sign[..., None] * normals[..., :, None, :]
     across = [jnp.sum(difference * t[..., :, None, :], axis=-1) for t in tangents]
-    room = offsets[..., None, :] - offsets[..., :, None]
+    room = offsets[..., None, :] - sign * offsets[..., :, None]
     room = room - jnp.sum(difference * middles[..., :, None, :], axis=-1)
-    room = jnp.where(room == 0, np.where(_FIRST, _TIE, -_TIE).astype(room.dtype), room)
-    # A parallel plane becomes a line far out, on the side that keeps all or nothing.
-    steepness = jnp.maximum(jnp.hypot(*across), _LEAST_STEEPNESS)
+    # A parallel plane becomes a line far out, on the side that keeps all or nothing of the face;
+    # one that coincides, too. The least steepness is far below any rounding, so a tie shifts
+    # nothing else.
+    least = float(jnp.finfo(room.dtype).tiny) ** 0.9
+    tie = jnp.where((sign > 0) & _FIRST, least * _FAR, -least * _FAR).astype(room.dtype)
+    room = jnp.where(room == 0, tie, room)
+    steepness = jnp.maximum(jnp.hypot(*across), least)
     pieces, middle_of_edge = _edges(jnp.arctan2(across[1], across[0]), room / steepness)
     areas = jnp.sum(pieces, axis=-1)
     # A triangle from the origin to an edge has its centroid at 2/3 of the way.
@@ -244,7 +251,8 @@ def _edges(angle: jax.Array, distance: jax.Array) -> tuple[jax.Array, jax.Array]
         even, (distance_k - distance_j) + versine * distance_j, distance_k + sin * distance_j
     )
     at = room / jnp.where(slope == 0, 1.0, slope)
-    outside = (slope == 0) & ((room < 0) | ((room == 0) & ~_FIRST))
+    wins_tie = _FIRST & (sign > 0)
+    outside = (slope == 0) & ((room < 0) | ((room == 0) & ~wins_tie))
     others = _CUTS[:, None, :] & (_INDEX[:, None] != _INDEX[None, :])
     upper = jnp.where(outside, -jnp.inf, jnp.where(slope > 0, at, jnp.inf))
     lower = jnp.where(slope < 0, at, -jnp.inf)
