@@ -84,6 +84,7 @@ def iou_size(size_a: ArrayLike, size_b: ArrayLike) -> jax.Array:
     return jnp.where(good, common / union, 0.0)
 
 
+@jax.jit
 def iou_full(
     rotation_a: ArrayLike,
     center_a: ArrayLike,
@@ -104,6 +105,7 @@ def iou_full(
 
     Returns:
       [...] in [0, 1]; 0 where a box has a size that is not positive, or anything is not finite.
+      Derivatives are right along rotations, as through ``so3.exp``.
     """
     rotation_a = as_floating(rotation_a, (3, 3), "rotation_a")
     rotation_b = as_floating(rotation_b, (3, 3), "rotation_b")
@@ -112,17 +114,23 @@ def iou_full(
         as_floating(center_b, (3,), "center_b"),
     )
     size_a, size_b = as_floating(size_a, (3,), "size_a"), as_floating(size_b, (3,), "size_b")
-    # In the frame of box a. I + A^T (B - A) is A^T B, and exactly I for equal boxes.
-    back = transpose(rotation_a)
-    rotation = jnp.eye(3, dtype=back.dtype) + multiply(back, rotation_b - rotation_a)
-    center = apply(back, center_b - center_a)
-
     good = _is_box(size_a) & _is_box(size_b)
-    good &= jnp.all(jnp.isfinite(rotation), axis=(-2, -1)) & jnp.all(jnp.isfinite(center), axis=-1)
-    rotation = jnp.where(good[..., None, None], rotation, jnp.eye(3, dtype=rotation.dtype))
-    center = jnp.where(good[..., None], center, 0.0)
+    for rotation in (rotation_a, rotation_b):
+        good &= jnp.all(jnp.isfinite(rotation), axis=(-2, -1))
+    for center in (center_a, center_b):
+        good &= jnp.all(jnp.isfinite(center), axis=-1)
+    # Unit boxes instead of bad ones, before any arithmetic: NaN would reach the derivatives.
+    identity = jnp.eye(3, dtype=rotation_a.dtype)
+    rotation_a, rotation_b = (
+        jnp.where(good[..., None, None], r, identity) for r in (rotation_a, rotation_b)
+    )
+    center_a, center_b = (jnp.where(good[..., None], c, 0.0) for c in (center_a, center_b))
     size_a, size_b = (jnp.where(good[..., None], size, 1.0) for size in (size_a, size_b))
 
+    # In the frame of box a. I + A^T (B - A) is A^T B, and exactly I for equal boxes.
+    back = transpose(rotation_a)
+    rotation = identity + multiply(back, rotation_b - rotation_a)
+    center = apply(back, center_b - center_a)
     volume_a, volume_b = jnp.prod(size_a, axis=-1), jnp.prod(size_b, axis=-1)
     common = _common_volume(rotation, center, size_a / 2, size_b / 2)
     # Rounding stays within the bounds; the derivative is that of the volume.
