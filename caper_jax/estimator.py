@@ -163,11 +163,9 @@ class Estimator:
         """
         single = np.ndim(points) == 2
         if isinstance(points, jax.core.Tracer):
-            batch = points[None] if single else points
-            prediction = self.function(self.variables, batch)
+            prediction = self.function(self.variables, points[None] if single else points)
         else:
-            batch = self._sampled(points)
-            prediction = self._jitted(self.variables, batch)
+            prediction = self._jitted(self.variables, self._sampled(points))
         return jax.tree.map(lambda array: array[0], prediction) if single else prediction
 
     def _sampled(self, points) -> np.ndarray:

@@ -11,14 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
 from caper_jax.articulation.category import Category, Equivalence, Joint
+from caper_jax.articulation.equivalence import second_reading
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.schema import pose_problems
 from caper_jax.errors import CaperError
-from caper_jax.evaluation.metrics import (
-    equivalent_reading,
-    pose_errors,
-    pose_errors_up_to_symmetry,
-)
+from caper_jax.evaluation.metrics import pose_errors, pose_errors_up_to_symmetry
 
 BOX = categories.get("box")
 FRAMES = 12
@@ -214,7 +211,7 @@ CYCLE = ((0, 0, 1), (-1, 0, 0), (0, -1, 0))
     ],
 )
 def test_a_second_reading_is_the_same_object(category, pose, equivalence):
-    reading = equivalent_reading(pose, equivalence, category)
+    reading = second_reading(pose, equivalence, category)
     assert not pose_problems(reading, category)
     found, expected = corners(reading), corners(pose)[:, list(equivalence.permutation)]
     distance = np.linalg.norm(found[..., :, None, :] - expected[..., None, :, :], axis=-1)
@@ -223,7 +220,7 @@ def test_a_second_reading_is_the_same_object(category, pose, equivalence):
 
 def test_errors_up_to_symmetry_take_the_better_reading_of_each_frame():
     truth = random_pose(FRAMES)
-    other = equivalent_reading(truth, BOX.equivalences[0], BOX)
+    other = second_reading(truth, BOX.equivalences[0], BOX)
     swapped = np.arange(FRAMES) % 3 == 0
     guess = mixed(swapped, other, truth)
     guess = turned(guess, [0.02, 0, 0], (0, 0.001, 0))
@@ -244,7 +241,7 @@ def test_impossible_symmetries_and_shapes_are_named():
         ((2, 1, 0), "puts the prismatic joint of part 2 where a revolute one belongs"),
     ):
         with pytest.raises(CaperError, match=message):
-            equivalent_reading(pose, Equivalence(order, same, ""), TURN_AND_SLIDE)
+            second_reading(pose, Equivalence(order, same, ""), TURN_AND_SLIDE)
     with pytest.raises(CaperError, match="estimate rotation has shape"):
         pose_errors(random_pose(FRAMES), pose, TURN_AND_SLIDE)
     with pytest.raises(CaperError, match=r"shape \(3, 3, 3, 3\), expected \(12, 3, 3, 3\)"):

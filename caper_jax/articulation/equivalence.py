@@ -5,47 +5,68 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from caper_jax.articulation.category import Equivalence
+from caper_jax.articulation.category import Category, Equivalence
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.errors import CaperError
 
 
-def second_reading(pose: ArticulatedPose, equivalence: Equivalence) -> ArticulatedPose:
+def second_reading(
+    pose: ArticulatedPose, equivalence: Equivalence, category: Category
+) -> ArticulatedPose:
     """The same object under the other reading: ``T'_k = T_permutation[k] S``.
 
+    The relative motion of two parts becomes ``S^-1 J S``: axes and pivots turn by S^-1, and an
+    axis also changes sign where parent and child change places, so that the states stay.
+
     Args:
-      pose: leading axes [...]; numpy or jax.
-      equivalence: the root stays the root, or the two parts of a two-part object change places.
+      pose: arrays [..., K, ...], numpy or jax; the result is of the same kind.
+      equivalence: one of the category's.
+      category: gives the tree of parts.
 
     Raises:
-      CaperError: another kind of permutation; what its joints become is not defined.
+      CaperError: the permutation joins parts that no joint, or one of another type, joins.
     """
     order = list(equivalence.permutation)
     turn = np.asarray(equivalence.turn)
-    back = turn.T
-    if order[0] == 0:
-        joints, sign = [part - 1 for part in order[1:]], 1.0
-    elif len(order) == 2:
-        # Root and child change places: the child's motion as its parent sees it is the inverse
-        # motion of the root, about the same line; positive still opens with the axis reversed.
-        joints, sign = [0], -1.0
-    else:
-        raise CaperError(
-            f"equivalence {order}: a constrained part can only become the root of two parts"
-        )
+    joints, signs = _matching_joints(order, category)
 
-    def rotated(vectors):
-        return (back * vectors[..., None, :]).sum(-1)
+    def turned(rows, by=turn):
+        # Row vectors times S, elementwise: exact on every backend, numpy or jax.
+        return (rows[..., :, None] * by.astype(rows.dtype)).sum(-2)
 
     return ArticulatedPose(
-        rotation=jnp.matmul(pose.rotation[..., order, :, :], turn, precision="highest"),
+        rotation=turned(pose.rotation[..., order, :, :]),
         translation=pose.translation[..., order, :],
-        size=jnp.abs(rotated(pose.size[..., order, :])),
-        box_center=rotated(pose.box_center[..., order, :]),
-        joint_axis=sign * rotated(pose.joint_axis[..., joints, :]),
-        joint_pivot=rotated(pose.joint_pivot[..., joints, :]),
+        size=turned(pose.size[..., order, :], np.abs(turn)),
+        box_center=turned(pose.box_center[..., order, :]),
+        joint_axis=signs[:, None].astype(pose.joint_axis.dtype)
+        * turned(pose.joint_axis[..., joints, :]),
+        joint_pivot=turned(pose.joint_pivot[..., joints, :]),
         joint_state=pose.joint_state[..., joints],
     )
+
+
+def _matching_joints(order: list[int], category: Category) -> tuple[list[int], np.ndarray]:
+    """For every joint of the second reading, the joint of the first and +1, or -1 if reversed."""
+    joint_of = {(parent, j + 1): j for j, parent in enumerate(category.parents)}
+    where = f"category {category.name!r}: equivalence {tuple(order)} puts"
+    joints, signs = [], []
+    for j, parent in enumerate(category.parents):
+        ends = order[parent], order[j + 1]
+        reverse = ends not in joint_of
+        joint = joint_of.get(ends[::-1] if reverse else ends)
+        if joint is None:
+            raise CaperError(
+                f"{where} a joint between parts {ends[0]} and {ends[1]}, which have none"
+            )
+        kind, expected = category.joint_types[joint], category.joint_types[j]
+        if kind != expected:
+            raise CaperError(
+                f"{where} the {kind} joint of part {joint + 1} where a {expected} one belongs"
+            )
+        joints.append(joint)
+        signs.append(-1.0 if reverse else 1.0)
+    return joints, np.array(signs)
 
 
 def second_labels(labels, equivalence: Equivalence):

@@ -142,15 +142,13 @@ def _contents(rng: np.random.Generator, size, wall: float, floor: float, top: fl
             things.append(box(place, (length / 2 - wall, reach, 0.0012)))
     for _ in range(rng.integers(0, 3)):
         half = 0.5 * room * rng.uniform(0.2, 0.9)
-        place = np.array(
-            [rng.uniform(-0.25, 0.25) * length, bottom + half, rng.uniform(-0.25, 0.25) * depth]
-        )
+        x, z = rng.uniform(-0.25, 0.25) * length, rng.uniform(-0.25, 0.25) * depth
         if rng.random() < 0.5:
             half_x, half_z = rng.uniform(0.05, 0.2) * length, rng.uniform(0.05, 0.2) * depth
-            things.append(box(place, (half_x, half, half_z)))
+            things.append(box((x, bottom + half, z), (half_x, half, half_z)))
         else:
             half_length = length * rng.uniform(0.1, 0.22)
-            things.append(cylinder(place, (half, half, half_length), _TURN_X))
+            things.append(cylinder((x, bottom + half, z), (half, half, half_length), _TURN_X))
     return things
 
 

@@ -61,8 +61,8 @@ def _base(rng: np.random.Generator, width: float, depth: float, thickness: float
         edge = (radius, radius, core[0])
         solids.append(cylinder((0, 0, half[2] - radius), edge, _TURN_X))
         for side in (-1, 1):
-            place = (side * core[0], 0, -radius / 2)
-            solids.append(cylinder(place, (radius, radius, half[2] - radius / 2)))
+            left = (side * core[0], 0, -radius / 2)
+            solids.append(cylinder(left, (radius, radius, half[2] - radius / 2)))
     solids += keyboard
     if rng.random() < 0.3:
         bulge = rng.uniform(0.003, 0.01)

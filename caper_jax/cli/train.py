@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from caper_jax.cli import common
-from caper_jax.errors import CaperError
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -37,11 +36,15 @@ def build_parser() -> argparse.ArgumentParser:
         help="one setting, e.g. training.batch_size=8; may be repeated",
     )
     budget = parser.add_mutually_exclusive_group()
-    budget.add_argument("--minutes", type=float, help="length of the run in minutes")
+    budget.add_argument(
+        "--minutes", type=common.positive_float, help="length of the run in minutes"
+    )
     budget.add_argument(
         "--steps", type=common.positive_int, help="length in steps: reproducible to the bit"
     )
-    parser.add_argument("--seed", type=int, help="of shapes, frames and weights (default: 0)")
+    parser.add_argument(
+        "--seed", type=common.non_negative_int, help="of shapes, frames and weights (default: 0)"
+    )
     parser.add_argument("--out", required=True, type=Path, help="folder of the run")
     return parser
 
@@ -63,8 +66,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             config, training=dataclasses.replace(config.training, **budget)
         )
     if arguments.seed is not None:
-        if arguments.seed < 0:
-            raise CaperError(f"--seed must not be negative, got {arguments.seed}")
         training = dataclasses.replace(config.training, seed=arguments.seed)
         config = dataclasses.replace(config, training=training)
     result = run.train(config, arguments.out)

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from caper_jax.articulation.category import Category, Equivalence
+from caper_jax.articulation.category import Category
+from caper_jax.articulation.equivalence import second_reading
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.schema import pose_shapes
 from caper_jax.errors import CaperError
@@ -110,7 +111,7 @@ def pose_errors_up_to_symmetry(
 
     Args and errors as for ``pose_errors``.
     """
-    readings = [truth, *(equivalent_reading(truth, e, category) for e in category.equivalences)]
+    readings = [truth, *(second_reading(truth, e, category) for e in category.equivalences)]
     scores = [pose_errors(estimate, reading, category, failed) for reading in readings]
     best = np.argmin([score.rotation_deg[:, 0] for score in scores], axis=0)
     frames = np.arange(len(best))
@@ -120,62 +121,6 @@ def pose_errors_up_to_symmetry(
             for field in fields(PoseErrors)
         }
     )
-
-
-def equivalent_reading(
-    pose: ArticulatedPose, equivalence: Equivalence, category: Category
-) -> ArticulatedPose:
-    """The second reading of the same object: ``T'_k = T_permutation[k] S``.
-
-    The relative motion of two parts becomes ``S^-1 J S``: axes and pivots turn by S^-1, and an
-    axis also changes sign where parent and child change places, so that the states stay.
-
-    Args:
-      pose: arrays [..., K, ...].
-      equivalence: one of the category's.
-      category: gives the tree of parts.
-
-    Raises:
-      CaperError: the permutation joins parts that no joint, or one of another type, joins.
-    """
-    order = list(equivalence.permutation)
-    turn = np.array(equivalence.turn)
-    joints, signs = _matching_joints(order, category)
-    arrays = {
-        key: np.asarray(getattr(pose, key), np.float64) for key in pose_shapes(category.num_parts)
-    }
-    return ArticulatedPose(
-        rotation=arrays["rotation"][..., order, :, :] @ turn,
-        translation=arrays["translation"][..., order, :],
-        size=arrays["size"][..., order, :] @ np.abs(turn),
-        box_center=arrays["box_center"][..., order, :] @ turn,
-        joint_axis=signs[:, None] * (arrays["joint_axis"][..., joints, :] @ turn),
-        joint_pivot=arrays["joint_pivot"][..., joints, :] @ turn,
-        joint_state=arrays["joint_state"][..., joints],
-    )
-
-
-def _matching_joints(order: list[int], category: Category) -> tuple[list[int], np.ndarray]:
-    """For every joint of the second reading, the joint of the first and +1, or -1 if reversed."""
-    joint_of = {(parent, j + 1): j for j, parent in enumerate(category.parents)}
-    where = f"category {category.name!r}: equivalence {tuple(order)} puts"
-    joints, signs = [], []
-    for j, parent in enumerate(category.parents):
-        ends = order[parent], order[j + 1]
-        reverse = ends not in joint_of
-        joint = joint_of.get(ends[::-1] if reverse else ends)
-        if joint is None:
-            raise CaperError(
-                f"{where} a joint between parts {ends[0]} and {ends[1]}, which have none"
-            )
-        kind, expected = category.joint_types[joint], category.joint_types[j]
-        if kind != expected:
-            raise CaperError(
-                f"{where} the {kind} joint of part {joint + 1} where a {expected} one belongs"
-            )
-        joints.append(joint)
-        signs.append(-1.0 if reverse else 1.0)
-    return joints, np.array(signs)
 
 
 @jax.jit

@@ -78,7 +78,7 @@ class BlockDense(nn.Module):
     @nn.compact
     def __call__(self, features: Features):
         """Features -> [B, N, width]."""
-        total = 0.0
+        total: Any = 0.0
         for number, level in enumerate(features.levels):
             bias = number == 0
             part = nn.Dense(self.width, use_bias=bias, name=f"level{number}")(level.features)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -96,7 +97,7 @@ class HSLayer(nn.Module):
         toward = directions(points, scope)
         if features is None:
             skip = nn.Dense(self.channels, use_bias=False, name="skip")(points)
-            center = 0.0
+            center: Any = 0.0
             active = directional_max(toward, scope, None, weights)
         else:
             skip = nn.Dense(self.channels, use_bias=False, name="skip")(features)

@@ -156,7 +156,7 @@ class Task:
         labels = batch.labels
         chosen = self._root_losses(output, truth)
         for equivalence in self.category.equivalences:
-            other = self._targets(second_reading(batch.pose, equivalence), view)
+            other = self._targets(second_reading(batch.pose, equivalence, self.category), view)
             other_losses = self._root_losses(output, other)
             weights = self.config.weights
             better = losses.weighted_total(weights, other_losses) < losses.weighted_total(

@@ -53,12 +53,12 @@ def render_image(
       CaperError: unknown noise preset.
     """
     sensor = jax.tree.map(lambda values: values[0], sensors.sensor_mix((noise,)))
-    draw = jax.jit(partial(_render, category=category, width=width, height=height))
-    depth, parts, intrinsics, pose = draw(key, instance, sensor)
+    depth, parts, intrinsics, pose = _render(key, instance, sensor, category, width, height)
     pose = jax.tree.map(np.asarray, pose)
     return Image(np.asarray(depth), np.asarray(parts), np.asarray(intrinsics, np.float64), pose)
 
 
+@partial(jax.jit, static_argnames=("category", "width", "height"))
 def _render(key, instance: Bank, sensor, category: Category, width: int, height: int):
     keys = jax.random.split(key, 4)
     state, poses, _ = draw_state_and_poses(keys[0], instance, category)
@@ -109,7 +109,7 @@ def write_frame(folder: str | Path, image: Image, category: Category, name: str)
     """Writes one frame as the commands read it.
 
     depth.png (16 bit, millimetres), mask.png (255 on the object), intrinsics.json and truth.json
-    (the fields of ArticulatedPose; metres and radians).
+    (the fields of ArticulatedPose; metres, and degrees for the states of revolute joints).
     """
     from PIL import Image as Picture
 
@@ -129,5 +129,9 @@ def write_frame(folder: str | Path, image: Image, category: Category, name: str)
     truth: dict[str, Any] = {"category": category.name, "frame": name}
     for field, values in vars(image.pose).items():
         truth[field] = np.round(np.asarray(values, np.float64), 9).tolist()
+    truth["joint_state"] = [
+        round(float(np.degrees(state) if kind == "revolute" else state), 7)
+        for state, kind in zip(image.pose.joint_state, category.joint_types, strict=True)
+    ]
     for file, content in (("intrinsics.json", camera), ("truth.json", truth)):
         (folder / file).write_text(json.dumps(content, indent=1) + "\n")

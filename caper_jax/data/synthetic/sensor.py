@@ -112,9 +112,14 @@ def surface(depth, hit, rays) -> Surface:
         reach = jnp.maximum(reach, other - depth)
     # The plane of a planar patch is linear in inverse depth: 1/z = a x + b y + c, with normal
     # (a, b, c); the ray (x, y, 1) meets it at cosine (1/z) / (|normal| |ray|).
+    # Across a jump there is no patch: take it as facing the axis there.
     inverse = 1.0 / jnp.maximum(depth, 1e-6)
-    side = jnp.where(right > 0, 1.0 / jnp.maximum(right, 1e-6), inverse)
-    below = jnp.where(down > 0, 1.0 / jnp.maximum(down, 1e-6), inverse)
+
+    def along(other):
+        smooth = jnp.abs(other - depth) <= 0.03 * depth
+        return jnp.where(smooth, 1.0 / jnp.maximum(other, 1e-6), inverse)
+
+    side, below = along(right), along(down)
     step_x = x[0, 1] - x[0, 0]
     step_y = y[1, 0] - y[0, 0]
     a = (side - inverse) / jnp.maximum(step_x, 1e-9)

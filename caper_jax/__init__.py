@@ -1,0 +1,33 @@
+"""caper_jax: category-level articulated object pose perception in JAX (CAPER++).
+
+    import caper_jax as caper
+
+    estimator = caper.load("box")
+    prediction = estimator(points)     # points [B, N, 3] metres, OpenCV camera frame
+    prediction.pose.rotation           # [B, K, 3, 3]
+"""
+
+from caper_jax import articulation, categories, geometry
+from caper_jax._version import __version__
+from caper_jax.articulation.category import Category, Equivalence, Joint, ObjectModel, Viewpoint
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.errors import CaperError
+from caper_jax.estimator import Estimator, Prediction, estimate, load
+
+__all__ = [
+    "ArticulatedPose",
+    "CaperError",
+    "Category",
+    "Equivalence",
+    "Estimator",
+    "Joint",
+    "ObjectModel",
+    "Prediction",
+    "Viewpoint",
+    "__version__",
+    "articulation",
+    "categories",
+    "estimate",
+    "geometry",
+    "load",
+]
