@@ -1,0 +1,250 @@
+"""Neighbourhoods and neighbour maxima: against numpy, finite differences and dense JAX."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from caper_jax.networks.graph import (
+    directional_max,
+    directions,
+    gather,
+    nearest,
+    nearest_row,
+    neighbour_max,
+    squared_distances,
+)
+
+B, N, K, C = 2, 12, 5, 3
+
+
+def random(*shape, seed=0):
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def dense_squared_distances(a, b):
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    return ((a[:, :, None] - b[:, None]) ** 2).sum(-1)
+
+
+@pytest.mark.parametrize("channels", [3, 6])
+def test_squared_distances(channels):
+    a, b = random(2, 9, channels), random(2, 7, channels, seed=1)
+    result = squared_distances(jnp.asarray(a), jnp.asarray(b))
+    np.testing.assert_allclose(result, dense_squared_distances(a, b), rtol=1e-5, atol=1e-5)
+
+
+def test_distances_of_points_are_exact_far_from_the_origin():
+    a = (np.random.default_rng(0).integers(0, 512, (1, 20, 3)) / 1024 + 1000).astype(np.float32)
+    assert (np.asarray(squared_distances(a, a)) == dense_squared_distances(a, a)).all()
+
+
+def test_distances_of_features_are_never_negative():
+    a = np.repeat(random(1, 10, 16) * 30, 2, axis=1)
+    assert squared_distances(jnp.asarray(a), jnp.asarray(a)).min() >= 0
+
+
+@pytest.mark.parametrize("channels", [3, 6])
+@pytest.mark.parametrize("exclude_self", [False, True])
+def test_nearest_is_argsort(channels, exclude_self):
+    points = random(2, 40, channels)
+    distance = dense_squared_distances(points, points)
+    if exclude_self:
+        distance[:, np.arange(40), np.arange(40)] = np.inf
+    result = nearest(jnp.asarray(points), jnp.asarray(points), 7, exclude_self)
+    assert result.dtype == jnp.int32
+    np.testing.assert_array_equal(result, distance.argsort(-1, kind="stable")[..., :7])
+
+
+def test_nearest_of_another_cloud():
+    query, points = random(2, 15, 3), random(2, 30, 3, seed=1)
+    order = dense_squared_distances(query, points).argsort(-1)
+    np.testing.assert_array_equal(nearest(query, points, 4), order[..., :4])
+    np.testing.assert_array_equal(nearest_row(query, points), order[..., 0])
+
+
+def test_ties_go_to_the_lower_row():
+    grid = np.stack(np.meshgrid(*[np.arange(4.0)] * 3), -1).reshape(1, 64, 3).astype(np.float32)
+    distance = dense_squared_distances(grid, grid)
+    order = distance.argsort(-1, kind="stable")
+    np.testing.assert_array_equal(nearest(grid, grid, 10), order[..., :10])
+    middle = grid[:, :5] + np.float32(0.5)
+    np.testing.assert_array_equal(
+        nearest_row(middle, grid), dense_squared_distances(middle, grid).argmin(-1)
+    )
+
+
+def test_a_repeated_point_is_a_neighbour_of_its_twin_but_never_of_itself():
+    points = np.repeat(random(1, 10, 3), 2, axis=1)
+    index = np.asarray(nearest(points, points, 3, exclude_self=True))[0]
+    np.testing.assert_array_equal(index[:, 0], np.arange(20) ^ 1)
+    same = np.ones((1, 20, 3), np.float32)
+    index = np.asarray(nearest(same, same, 6, exclude_self=True))[0]
+    assert (index != np.arange(20)[:, None]).all()
+    assert all(len(set(row)) == 6 for row in index)
+
+
+def test_nearest_does_not_sort():
+    """top_k(k + 1)[1:], the obvious way to leave the point itself out, becomes a full sort."""
+    points = jnp.zeros((2, 64, 8))
+
+    def compiled(function):
+        return jax.jit(function).lower(points).compile().as_text()
+
+    assert " sort(" in compiled(partial(jnp.sort, axis=1))  # what a sort looks like
+    assert " sort(" not in compiled(lambda x: nearest(x, x, 20, exclude_self=True))
+
+
+@pytest.mark.parametrize("shape", [(4,), (4, 3)])
+def test_gather_takes_rows_per_batch_element(shape):
+    rows, index = random(2, 9, 5), np.random.default_rng(1).integers(0, 9, (2, *shape))
+    expected = np.stack([rows[b][index[b]] for b in range(2)])
+    np.testing.assert_array_equal(gather(jnp.asarray(rows), jnp.asarray(index)), expected)
+
+
+def test_directions():
+    points = random(2, 10, 3)
+    points[:, 4] = points[:, 3]
+    index = np.asarray(nearest(points, points, 4, exclude_self=True))
+    result = np.asarray(directions(jnp.asarray(points), jnp.asarray(index)))
+    for b in range(2):
+        offset = points[b][index[b]] - points[b][:, None]
+        length = np.linalg.norm(offset, axis=-1, keepdims=True)
+        np.testing.assert_allclose(result[b], offset / np.where(length > 0, length, 1), atol=1e-6)
+    assert index[0, 4, 0] == 3
+    assert (result[0, 4, 0] == 0).all()
+
+
+def test_directions_have_finite_gradients_at_coincident_points():
+    with jax.enable_x64(True):
+        points = random(1, 6, 3).astype(np.float64)
+        index = jnp.asarray([[[1, 2], [0, 3], [4, 5], [5, 1], [0, 1], [2, 0]]])
+        check_grads(lambda x: directions(x, index), (points,), order=1, modes=["rev", "fwd"])
+        points[0, 1] = points[0, 0]
+        weights = random(1, 6, 2, 3)
+
+        def total(x):
+            return (directions(x, index) * weights).sum()
+
+        # Without the coincident pair (0 -> 1, 1 -> 0) nothing changes: it adds no slope.
+        apart = weights.copy()
+        apart[0, 0, 0] = apart[0, 1, 0] = 0
+        with_pair, weights = jax.grad(total)(points), apart
+        assert np.isfinite(with_pair).all()
+        np.testing.assert_allclose(with_pair, jax.grad(total)(points), atol=1e-12)
+
+
+def dense_directional_max(direction, index, features, weights):
+    """The maximum in the open: [B, N, k, C] at once."""
+    theta = jax.nn.relu(jnp.einsum("bnki,ic->bnkc", direction, weights))
+    if features is not None:
+        theta = theta * jax.vmap(lambda rows, at: rows[at])(features, index)
+    return theta.max(2)
+
+
+def layer_inputs(seed=0, neighbours=K):
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(B, N, neighbours, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    index = np.argsort(rng.random((B, N, N)), -1)[..., :neighbours]
+    return direction, index, rng.normal(size=(B, N, C)), rng.normal(size=(3, C))
+
+
+@pytest.mark.parametrize("neighbours", [1, K])
+@pytest.mark.parametrize("surface", [True, False])
+def test_directional_max_and_its_gradients(surface, neighbours):
+    with jax.enable_x64(True):
+        direction, index, features, weights = layer_inputs(neighbours=neighbours)
+        direction[0, 0, 0] = 0.0  # a coincident neighbour
+        arguments = (direction, weights) if surface else (direction, weights, features)
+        cotangent = jnp.asarray(random(B, N, C, seed=3), jnp.float64)
+
+        def value(function, direction, weights, features=None):
+            return function(direction, jnp.asarray(index), features, weights)
+
+        def total(function, *arguments):
+            return (value(function, *arguments) * cotangent).sum()
+
+        expected = value(dense_directional_max, *arguments)
+        np.testing.assert_allclose(value(directional_max, *arguments), expected, atol=1e-14)
+        which = tuple(range(len(arguments)))
+        ours = jax.jit(jax.grad(partial(total, directional_max), which))(*arguments)
+        theirs = jax.grad(partial(total, dense_directional_max), which)(*arguments)
+        for one, other in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-13)
+        if not surface and neighbours == K:
+            check_grads(partial(value, directional_max), arguments, order=1, modes=["rev"])
+
+
+def test_directional_max_with_the_most_neighbours():
+    """The winner's number is a uint8: the 256th neighbour still counts."""
+    direction = np.tile(np.float32([0, 0, 0.5]), (1, 1, 256, 1))
+    direction[0, 0, 255] = [0, 0, 1.0]
+    weights = np.float32([[0], [0], [1]])
+    features = np.arange(256, dtype=np.float32).reshape(1, 256, 1)
+    index = np.arange(256)[None, None]
+    value, pull = jax.vjp(lambda f: directional_max(direction, index, f, weights), features)
+    assert value[0, 0, 0] == 255.0
+    gradient = pull(jnp.ones((1, 1, 1)))[0]
+    assert gradient[0, 255, 0] == 1.0 and gradient.sum() == 1.0
+
+
+def test_neighbour_max_and_its_gradient():
+    with jax.enable_x64(True):
+        _, index, features, _ = layer_inputs()
+        index = index[:, : N // 2]  # fewer queries than rows, as in pooling
+        index[0, 0] = 7  # the same row five times
+        cotangent = jnp.asarray(random(B, N // 2, C, seed=3), jnp.float64)
+
+        def dense(features):
+            return jax.vmap(lambda rows, at: rows[at])(features, index).max(2)
+
+        def ours(features):
+            return neighbour_max(features, jnp.asarray(index))
+
+        np.testing.assert_array_equal(ours(features), dense(features))
+        gradients = [
+            jax.grad(lambda f, fn=fn: (fn(f) * cotangent).sum())(features) for fn in (ours, dense)
+        ]
+        np.testing.assert_allclose(gradients[0], gradients[1], atol=1e-14)
+        check_grads(ours, (features,), order=1, modes=["rev"])
+
+
+def test_a_tie_sends_its_gradient_to_one_winner():
+    features = jnp.ones((1, 3, 1))
+    index = jnp.asarray([[[2, 0, 1]]])
+    gradient = jax.grad(lambda f: neighbour_max(f, index).sum())(features)
+    np.testing.assert_array_equal(gradient[0, :, 0], [0, 0, 1])
+    direction = jnp.tile(jnp.asarray([0.0, 0.0, 1.0]), (1, 1, 3, 1))
+    weights = jnp.asarray([[0.0], [0.0], [1.0]])
+    gradient = jax.grad(lambda f: directional_max(direction, index, f, weights).sum())(features)
+    np.testing.assert_array_equal(gradient[0, :, 0], [0, 0, 1])
+
+
+def test_vmap_equals_one_by_one():
+    stacks = [np.stack(rows) for rows in zip(*(layer_inputs(seed) for seed in (1, 2)), strict=True)]
+    direction, index, features, weights = (
+        jnp.asarray(s, jnp.int32 if s.dtype.kind == "i" else jnp.float32) for s in stacks
+    )
+
+    def both(direction, index, features, weights):
+        def total(direction, features, weights):
+            value = directional_max(direction, index, features, weights)
+            return (neighbour_max(value, index) ** 2).sum()
+
+        return jax.value_and_grad(total, (0, 1, 2))(direction, features, weights)
+
+    together = jax.jit(jax.vmap(both))(direction, index, features, weights)
+    both = jax.jit(both)
+    for i in range(2):
+        alone = both(direction[i], index[i], features[i], weights[i])
+        jax.tree.map(
+            lambda many, one, i=i: np.testing.assert_allclose(many[i], one, rtol=1e-5, atol=1e-6),
+            together,
+            alone,
+        )
