@@ -23,7 +23,7 @@ def _pencil_case(rng: np.random.Generator) -> ObjectModel:
     length = scale * rng.uniform(0.19, 0.25)
     height = scale * rng.uniform(0.022, 0.042)
     depth = scale * rng.uniform(0.068, 0.105)
-    wall = scale * rng.uniform(0.002, 0.007)
+    wall = scale * rng.uniform(0.002, 0.011)
     lid_depth = depth * rng.uniform(0.9, 1.06)
     lid_length = length * rng.uniform(0.95, 1.02)
     on_top = rng.random() < 0.4
@@ -38,8 +38,11 @@ def _pencil_case(rng: np.random.Generator) -> ObjectModel:
         hinge_y = height / 2 - height * rng.uniform(0.1, 0.45)
     hinge_z = -depth / 2 + depth * rng.uniform(0.0, 0.1)
 
-    # Cavity, open at the top; an inlay may fill it almost to the rim.
-    floor = wall + (0.0 if rng.random() < 0.5 else rng.uniform(0.0, 0.55) * height)
+    # Cavity, open at the top. Most cases have an inlay: what shows is its upper side, often
+    # halfway up.
+    floor = wall if rng.random() < 0.3 else rng.uniform(0.2, 0.7) * height
+    if not on_top:  # room for a lid let in
+        floor = min(floor, max(wall, lid_bottom - 0.002 + height / 2))
     base = [_tray((length, height, depth), wall, floor, upside_down=False)]
     base += _contents(rng, (length, height, depth), wall, floor, lid_bottom)
     if not on_top and rng.random() < 0.5:
@@ -52,7 +55,22 @@ def _pencil_case(rng: np.random.Generator) -> ObjectModel:
         )
     lid_front = hinge_z + lid_depth
     lid_center = (0.0, lid_bottom + lid_thickness / 2, (hinge_z + lid_front) / 2)
-    lid = [_lid_shell(rng, lid_center, (lid_length, lid_thickness, lid_depth), wall)]
+    if rng.random() < 0.4:
+        # A thin plate; a lip around it makes the lid's box as thick as measured.
+        plate = min(scale * rng.uniform(0.002, 0.005), lid_thickness)
+        top = lid_bottom + lid_thickness
+        lid = [
+            box(
+                (0, top - plate / 2, lid_center[2]),
+                (lid_length / 2, plate / 2, lid_depth / 2),
+            ),
+            box(
+                (0, lid_center[1], lid_front - plate / 2),
+                (lid_length / 2, lid_thickness / 2, plate / 2),
+            ),
+        ]
+    else:
+        lid = [_lid_shell(rng, lid_center, (lid_length, lid_thickness, lid_depth), wall)]
     if rng.random() < 0.5:
         lid.append(_clasp(rng, lid_center, (lid_length, lid_thickness, lid_depth), height))
     if rng.random() < 0.3:

@@ -20,6 +20,7 @@ def build_parser() -> argparse.ArgumentParser:
         [
             ("--category box --minutes 30 --out runs/box", "the fast preset, half an hour"),
             ("--category box --config configs/fast.toml --minutes 30 --out runs/box", ""),
+            ("--category box --from runs/box --minutes 10 --out runs/box2", "goes on from a model"),
             ("--category laptop --preset paper --steps 1000 --out runs/paper", ""),
             ("--category box --set training.learning_rate=1e-3 --steps 500 --out runs/try", ""),
         ],
@@ -34,6 +35,13 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="KEY=VALUE",
         dest="overrides",
         help="one setting, e.g. training.batch_size=8; may be repeated",
+    )
+    parser.add_argument(
+        "--from",
+        type=Path,
+        dest="initial",
+        metavar="DIR",
+        help="start from the weights of this model instead of random ones",
     )
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument(
@@ -68,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.seed is not None:
         training = dataclasses.replace(config.training, seed=arguments.seed)
         config = dataclasses.replace(config, training=training)
-    result = run.train(config, arguments.out)
+    result = run.train(config, arguments.out, arguments.initial)
     steps = int(result.state.step)
     if not result.finished:
         print(f"stopped at step {steps}; the same command goes on from there")

@@ -8,18 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from caper_jax import categories
 from caper_jax._version import __version__
-from caper_jax.articulation.category import Category
 from caper_jax.configuration import to_dict
 from caper_jax.data.synthetic.scene import Batch, Generator, GeneratorConfig
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.networks.caper import NetworkConfig
 from caper_jax.networks.presets import PRESETS as NETWORKS
 from caper_jax.training import parallel
-from caper_jax.training.export import write_model
+from caper_jax.training.export import flatten, read_model, write_model
 from caper_jax.training.loop import FitResult, TrainingConfig, fit
 from caper_jax.training.task import LossConfig, Task
 
@@ -87,13 +87,15 @@ def preset(name: str, category: str) -> RunConfig:
     )
 
 
-def train(config: RunConfig, directory: str | Path) -> FitResult:
+def train(config: RunConfig, directory: str | Path, initial: str | Path | None = None) -> FitResult:
     """Trains, validates and writes a model directory; resumes when the directory holds the run.
 
     Args:
       config: the run.
       directory: gets config.json, metrics.jsonl, checkpoints/ and, once the budget is used up,
         weights.npz and model.json.
+      initial: model directory whose weights the run starts from (its card is kept in the new
+        one); by default the weights are random.
 
     Raises:
       CaperError: see ``training.loop.fit``.
@@ -108,12 +110,17 @@ def train(config: RunConfig, directory: str | Path) -> FitResult:
 
     description = to_dict(config)
     description.pop("training")
+    variables, started_from = task.init(jax.random.key(config.training.seed)), None
+    if initial is not None:
+        started_from, stored = read_model(initial)
+        variables = _initial_variables(variables, stored, initial)
+        description["initial"] = started_from
     mesh = parallel.data_mesh() if jax.device_count() > 1 else None
     result = fit(
         directory,
         config.training,
         task.loss,
-        task.init(jax.random.key(config.training.seed)),
+        variables,
         batch_fn=batch_fn,
         data=generator.bank,
         mesh=mesh,
@@ -121,8 +128,23 @@ def train(config: RunConfig, directory: str | Path) -> FitResult:
     )
     if result.finished and jax.process_index() == 0:
         variables = jax.device_get(result.state.variables)
-        write_model(directory, variables, _card(config, category, generator, result))
+        card = _card(config, generator, result)
+        if started_from is not None:
+            card["started_from"] = started_from
+        write_model(directory, variables, card)
     return result
+
+
+def _initial_variables(template: Any, stored: Any, directory: str | Path) -> Any:
+    """Stored weights in the place of random ones; CaperError where they do not fit."""
+    wanted, found = flatten(template), flatten(stored)
+    shapes = {name: np.shape(leaf) for name, leaf in wanted.items()}
+    if shapes != {name: np.shape(leaf) for name, leaf in found.items()}:
+        raise CaperError(
+            f"{directory}: its weights are of another network than this run's; use the same "
+            "category, preset and network settings"
+        )
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), stored)
 
 
 def mean_pose(batch: Batch) -> dict[str, Any]:
@@ -148,14 +170,12 @@ def mean_pose(batch: Batch) -> dict[str, Any]:
     }
 
 
-def _card(
-    config: RunConfig, category: Category, generator: Generator, result: FitResult
-) -> dict[str, Any]:
+def _card(config: RunConfig, generator: Generator, result: FitResult) -> dict[str, Any]:
     """The model card: what was trained on what, where, and for how long."""
     sample = generator.batch(jax.random.key(config.training.seed), 512)
     state = result.state
     return {
-        "category": category.name,
+        "category": config.category,
         "version": __version__,
         "run": to_dict(config),
         "steps": int(state.step),

@@ -1,0 +1,100 @@
+"""The commands in a row: generate, train, resume, fine-tune, evaluate, estimate, on a tiny model."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from caper_jax import cli
+from caper_jax.configuration import update
+from caper_jax.training import run
+from caper_jax.training.export import read_model
+
+ROOT = Path(__file__).resolve().parents[1]
+TINY = ["--category", "box", "--config", str(ROOT / "configs" / "debug.toml")]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """A model directory trained for a few steps."""
+    folder = tmp_path_factory.mktemp("run") / "box"
+    assert cli.main(["train", *TINY, "--steps", "10", "--out", str(folder)]) == 0
+    return folder
+
+
+def test_a_run_leaves_a_model_with_its_card(model):
+    card, variables = read_model(model)
+    assert card["category"] == "box" and card["steps"] == 10 and card["samples"] == 40
+    assert card["run"]["network"]["num_points"] == 128
+    assert set(variables["params"]) == {"root", "parts"}
+    assert np.shape(card["mean_pose"]["rotation"]) == (3, 3)
+    lines = [json.loads(line) for line in (model / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [5, 10]
+    assert lines[1]["loss"] < lines[0]["loss"]
+
+
+def test_another_configuration_in_the_same_folder_is_refused(model, capsys):
+    arguments = ["train", *TINY, "--set", "loss.state_penalty=7", "--steps", "10"]
+    assert cli.main([*arguments, "--out", str(model)]) == 2
+    assert "state_penalty" in capsys.readouterr().err
+
+
+def test_evaluate_and_estimate_take_the_model(model, tmp_path, capsys):
+    file, results = tmp_path / "test.h5", tmp_path / "results"
+    common = ["--category", "box", "--frames", "5", "--instances", "3"]
+    arguments = ["--grid", "24", "--points", "256", "--noise", "kinect", "--out", str(file)]
+    assert cli.main(["generate", *common, *arguments]) == 0
+    assert cli.main(["generate", *common, *arguments]) == 2  # refuses to overwrite
+    assert str(file) in capsys.readouterr().err
+
+    evaluate = ["evaluate", "--category", "box", "--data", str(file), "--format", "caper"]
+    evaluate += ["--weights", str(model), "--out", str(results)]
+    assert cli.main(evaluate) == 0
+    metrics = json.loads((results / "metrics.json").read_text())
+    assert metrics["frames"] == 5 and metrics["failures"] == 0
+    arrays = np.load(results / "predictions.npz")
+    assert arrays["R"].shape == (5, 2, 3, 3)
+    # The printed means can be recomputed from the file.
+    cosine = (np.einsum("fkij,fkij->fk", arrays["R"], arrays["truth_R"]) - 1) / 2
+    degrees = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean(axis=0)
+    reported = [part["rotation_deg"]["mean"] for part in metrics["parts"]]
+    np.testing.assert_allclose(degrees, reported, rtol=1e-3)
+
+    points = tmp_path / "cloud.npy"
+    np.save(points, np.random.default_rng(0).normal((0, 0, 0.7), 0.1, (500, 3)))
+    out = tmp_path / "pose.json"
+    estimate = ["estimate", "--category", "box", "--points", str(points), "--json", str(out)]
+    assert cli.main([*estimate, "--weights", str(model)]) == 0
+    assert np.shape(json.loads(out.read_text())["rotation"]) == (2, 3, 3)
+
+
+def test_a_model_can_start_another_run(model, tmp_path):
+    folder = tmp_path / "more"
+    arguments = ["train", *TINY, "--from", str(model), "--steps", "5", "--seed", "3"]
+    assert cli.main([*arguments, "--out", str(folder)]) == 0
+    card, _ = read_model(folder)
+    assert card["started_from"]["steps"] == 10 and card["steps"] == 5
+
+
+def test_a_model_of_another_network_cannot(model, tmp_path, capsys):
+    arguments = ["train", "--category", "box", "--from", str(model), "--steps", "5"]
+    assert cli.main([*arguments, "--out", str(tmp_path / "no")]) == 2
+    assert str(model) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "configs").glob("*.toml")))
+def test_every_configuration_file_is_valid(name):
+    base = run.preset("paper" if name == "paper" else "fast", "box")
+    assert update(base, ROOT / "configs" / f"{name}.toml").category == "box"
+
+
+def test_unknown_key_names_the_nearest(tmp_path, capsys):
+    file = tmp_path / "wrong.toml"
+    file.write_text("[training]\nlerning_rate = 1e-3\n")
+    arguments = ["train", "--category", "box", "--config", str(file), "--steps", "1"]
+    assert cli.main([*arguments, "--out", str(tmp_path / "run")]) == 2
+    message = capsys.readouterr().err
+    assert "learning_rate" in message and str(file) in message and message.count("\n") == 1
