@@ -1,50 +1,43 @@
-"""Transforms of single joints (paper Sec 5.2.2, Eq 8 in its right form)."""
+"""Transforms of joints (paper Sec 5.2.2; Eq 8 in its right form, ``[R | (I - R) q]``).
+
+A state is measured from the rest pose, in radians (revolute) or metres (prismatic). A positive one
+turns the child by plus the state about the axis, or slides it by plus the state along the axis.
+Axes are scaled to unit length here; a zero axis gives the identity, with finite derivatives.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from caper_jax.errors import unknown_name
 from caper_jax.geometry import se3, so3
-from caper_jax.geometry.linalg import as_floating, unit
+from caper_jax.geometry.linalg import as_floating, cross, unit
 
 
 def revolute_transform(axis: ArrayLike, pivot: ArrayLike, angle: ArrayLike) -> jax.Array:
-    """Turn by plus ``angle`` about the line through ``pivot``: ``[R | (I - R) q]``.
+    """Turn [..., 4, 4] about the line through ``pivot``.
 
     R is Rodrigues' rotation about the unit axis u, ``cos I + (1 - cos) u u^T + sin hat(u)``.
 
     Args:
-      axis: [..., 3] direction of the line, scaled to unit length here; a zero vector gives the
-        identity.
+      axis: [..., 3] direction of the line.
       pivot: [..., 3] metres; any point of the line.
       angle: [...] radians.
-
-    Returns:
-      [..., 4, 4].
     """
-    u = unit(as_floating(axis, (3,), "axis"))
-    q = as_floating(pivot, (3,), "pivot")
-    angle = as_floating(angle, (), "angle")
-    sin, versine = jnp.sin(angle), 2 * jnp.sin(angle / 2) ** 2
-    # (I - R) q from the same terms: small for small angles, where the difference q - R q would
-    # be left with the rounding of q.
-    turned = jnp.cross(u, q)
-    shift = -sin[..., None] * turned - versine[..., None] * jnp.cross(u, turned)
-    return se3.from_rt(so3.rodrigues(u, sin, versine), shift)
+    return joint_transform("revolute", axis, pivot, angle)
 
 
 def prismatic_transform(axis: ArrayLike, displacement: ArrayLike) -> jax.Array:
-    """Slide by plus ``displacement`` along the axis: ``[I | d u]``.
+    """Slide [..., 4, 4] along an axis: ``[I | d u]``.
 
     Args:
-      axis: [..., 3] direction, scaled to unit length here; a zero vector gives the identity.
+      axis: [..., 3] direction.
       displacement: [...] metres.
-
-    Returns:
-      [..., 4, 4].
     """
     u = unit(as_floating(axis, (3,), "axis"))
     shift = u * as_floating(displacement, (), "displacement")[..., None]
@@ -58,15 +51,48 @@ def joint_transform(
 
     Args:
       joint_type: "revolute" or "prismatic".
-      axis: [..., 3] unit vector in the root's canonical (rest) frame.
-      pivot: [..., 3] metres, same frame; ignored by a prismatic joint.
-      state: [...] radians or metres from the rest pose; positive opens.
+      axis: [..., 3] in the root's canonical (rest) frame.
+      pivot: [..., 3] metres, same frame; without effect on a prismatic joint.
+      state: [...] radians or metres.
 
     Raises:
       CaperError: unknown joint type.
     """
-    if joint_type == "revolute":
-        return revolute_transform(axis, pivot, state)
-    if joint_type == "prismatic":
-        return prismatic_transform(axis, state)
-    raise unknown_name("joint type", joint_type, ("revolute", "prismatic"))
+    axis = as_floating(axis, (3,), "axis")[..., None, :]
+    pivot = as_floating(pivot, (3,), "pivot")[..., None, :]
+    state = as_floating(state, (), "state")[..., None]
+    return joint_transforms([joint_type], axis, pivot, state)[..., 0, :, :]
+
+
+def joint_transforms(
+    joint_types: Sequence[str], axis: ArrayLike, pivot: ArrayLike, state: ArrayLike
+) -> jax.Array:
+    """Transforms [..., J, 4, 4] of J joints, each at its own state.
+
+    Args:
+      joint_types: J times "revolute" or "prismatic".
+      axis: [..., J, 3] in the root's canonical (rest) frame.
+      pivot: [..., J, 3] metres, same frame; without effect on a prismatic joint.
+      state: [..., J] radians or metres.
+
+    Raises:
+      CaperError: unknown joint type.
+    """
+    known = ("revolute", "prismatic")
+    for name in joint_types:
+        if name not in known:
+            raise unknown_name("joint type", name, known)
+    turns = np.array([name == "revolute" for name in joint_types], dtype=bool)
+    count = len(turns)
+    u = unit(as_floating(axis, (count, 3), "axis"))
+    q = as_floating(pivot, (count, 3), "pivot")
+    state = as_floating(state, (count,), "state")
+    angle, slide = jnp.where(turns, state, 0.0), jnp.where(turns, 0.0, state)
+
+    sin, versine = jnp.sin(angle), 2 * jnp.sin(angle / 2) ** 2
+    rotation = so3.rodrigues(u, sin, versine)
+    # (I - R) q from the same terms: small for small angles, where the difference q - R q would
+    # be left with the rounding of q.
+    turned = cross(u, q)
+    shift = slide[..., None] * u - sin[..., None] * turned - versine[..., None] * cross(u, turned)
+    return se3.from_rt(rotation, shift)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from caper_jax.articulation.joints import joint_transform
+from caper_jax.articulation.joints import joint_transforms
 from caper_jax.errors import CaperError
 from caper_jax.geometry import se3
 from caper_jax.geometry.linalg import as_floating
@@ -51,13 +51,8 @@ def forward_kinematics(
                 f"0 to {joint}"
             )
     root = as_floating(root, (4, 4), "root")
-    axis = as_floating(axis, (joints, 3), "axis")
-    pivot = as_floating(pivot, (joints, 3), "pivot")
-    state = as_floating(state, (joints,), "state")
+    motions = joint_transforms(joint_types, axis, pivot, state)
     poses = [root]
-    for joint, (joint_type, parent) in enumerate(zip(joint_types, parents, strict=True)):
-        motion = joint_transform(
-            joint_type, axis[..., joint, :], pivot[..., joint, :], state[..., joint]
-        )
-        poses.append(se3.compose(poses[parent], motion))
+    for joint, parent in enumerate(parents):
+        poses.append(se3.compose(poses[parent], motions[..., joint, :, :]))
     return jnp.stack(jnp.broadcast_arrays(*poses), axis=-3)

@@ -38,7 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from caper_jax.geometry.linalg import apply, as_floating, multiply, transpose
+from caper_jax.geometry.linalg import apply, as_floating, dot, multiply, transpose
 
 # Faces are numbered box * 6 + axis * 2 + (0 for the positive side, 1 for the negative).
 _INDEX = np.arange(12)
@@ -167,7 +167,7 @@ def _half_spaces(
     """Outward normals [..., 12, 3] and offsets [..., 12]: ``n . x <= b``."""
     axes, origins, halves = _both(rotation, center, half_a, half_b)
     normals = axes[..., :, :, None, :] * _SIGN.astype(axes.dtype)[:, None]
-    offsets = halves[..., None] + jnp.sum(normals * origins[..., :, None, None, :], axis=-1)
+    offsets = halves[..., None] + dot(normals, origins[..., :, None, None, :])
     batch = axes.shape[:-3]
     return normals.reshape(*batch, 12, 3), offsets.reshape(*batch, 12)
 
@@ -206,11 +206,11 @@ def _faces(
 
     # On plane i, plane k leaves the half-plane  across . y <= room.  [..., i, k, (3)]
     # 1 for planes facing the same way, -1 for the opposite, 0 for those well apart.
-    sign = jnp.round(jnp.sum(normals[..., None, :, :] * normals[..., :, None, :], axis=-1))
+    sign = jnp.round(dot(normals[..., None, :, :], normals[..., :, None, :]))
     difference = normals[..., None, :, :] - sign[..., None] * normals[..., :, None, :]
-    across = [jnp.sum(difference * t[..., :, None, :], axis=-1) for t in tangents]
+    across = [dot(difference, t[..., :, None, :]) for t in tangents]
     room = offsets[..., None, :] - sign * offsets[..., :, None]
-    room = room - jnp.sum(difference * middles[..., :, None, :], axis=-1)
+    room = room - dot(difference, middles[..., :, None, :])
     # A parallel plane becomes a line far out, on the side that keeps all or nothing of the face;
     # one that coincides, too. The least steepness is far below any rounding, so a tie shifts
     # nothing else.

@@ -21,7 +21,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from caper_jax.errors import CaperError
-from caper_jax.geometry.linalg import as_floating, norm, unit
+from caper_jax.geometry.linalg import as_floating, cross, dot, norm, unit
 
 
 def rotation_from_directions(
@@ -62,19 +62,19 @@ def rotation_from_directions(
     first = jnp.where(first_good[..., None], first, spare_first)
     second = jnp.where(second_good[..., None], second, spare_second)
 
-    normal = jnp.cross(first, second)
+    normal = cross(first, second)
     sine = norm(normal)
     # Below this sine the plane of the two is rounding noise.
     parallel = sine < math.sqrt(float(jnp.finfo(first.dtype).eps))
     normal = unit(jnp.where(parallel[..., None], _perpendicular(first), normal))
     # Once more: for a small sine the cross product is not quite perpendicular.
-    normal = unit(normal - first * jnp.sum(first * normal, axis=-1, keepdims=True))
+    normal = unit(normal - first * dot(first, normal)[..., None])
 
-    excess = jnp.arctan2(sine, jnp.sum(first * second, axis=-1)) - math.pi / 2
+    excess = jnp.arctan2(sine, dot(first, second)) - math.pi / 2
     share, share_good = _share(confidence_first, confidence_second)
     turn = (share * excess)[..., None]
-    first = jnp.cos(turn) * first + jnp.sin(turn) * jnp.cross(normal, first)
-    columns = {i: first, j: jnp.cross(normal, first), k: sign * normal}
+    first = jnp.cos(turn) * first + jnp.sin(turn) * cross(normal, first)
+    columns = {i: first, j: cross(normal, first), k: sign * normal}
     rotation = jnp.stack(jnp.broadcast_arrays(*(columns[c] for c in range(3))), axis=-1)
     return rotation, parallel | ~(first_good & second_good & share_good)
 
@@ -99,7 +99,7 @@ def _perpendicular(vector: jax.Array) -> jax.Array:
     """Some unit vector at right angles to each unit vector [..., 3]; constant in derivatives."""
     vector = jax.lax.stop_gradient(vector)
     least = jnp.argmin(jnp.abs(vector), axis=-1)
-    return unit(jnp.cross(vector, jax.nn.one_hot(least, 3, dtype=vector.dtype)))
+    return unit(cross(vector, jax.nn.one_hot(least, 3, dtype=vector.dtype)))
 
 
 def _share(first: ArrayLike, second: ArrayLike) -> tuple[jax.Array, jax.Array]:

@@ -30,9 +30,21 @@ def as_floating(value: ArrayLike, shape: Sequence[int], name: str) -> jax.Array:
     return array.astype(jnp.result_type(float))
 
 
+def dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Inner product [...] of vectors [..., D], for small D."""
+    terms = [a[..., i] * b[..., i] for i in range(a.shape[-1])]
+    return sum(terms[1:], start=terms[0])
+
+
+def cross(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Cross product [..., 3] of vectors [..., 3]."""
+    pairs = ((1, 2), (2, 0), (0, 1))
+    return jnp.stack([a[..., i] * b[..., j] - a[..., j] * b[..., i] for i, j in pairs], axis=-1)
+
+
 def norm(vector: jax.Array) -> jax.Array:
     """Euclidean length [...] of vectors [..., D], with derivative 0 at the zero vector."""
-    squared = jnp.sum(vector * vector, axis=-1)
+    squared = dot(vector, vector)
     zero = squared == 0.0
     # Both branches of a `where` are differentiated, so sqrt must not see the zero.
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))

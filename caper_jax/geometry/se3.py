@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from caper_jax.geometry import so3
-from caper_jax.geometry.linalg import apply, as_floating, multiply, norm, transpose
+from caper_jax.geometry.linalg import apply, as_floating, cross, dot, multiply, norm, transpose
 
 
 def from_rt(rotation: ArrayLike, translation: ArrayLike) -> jax.Array:
@@ -51,11 +51,9 @@ def exp(xi: ArrayLike) -> jax.Array:
     """Transform [..., 4, 4] of a twist (w, rho) [..., 6]."""
     w, rho = _split(xi)
     first, second, third = so3.exp_coefficients(so3.trigonometry(w))
-    along = jnp.sum(w * rho, axis=-1)
+    along = dot(w, rho)
     translation = (
-        first[..., None] * rho
-        + second[..., None] * jnp.cross(w, rho)
-        + (third * along)[..., None] * w
+        first[..., None] * rho + second[..., None] * cross(w, rho) + (third * along)[..., None] * w
     )
     return from_rt(so3.exp(w), translation)
 
@@ -65,8 +63,8 @@ def log(transform: ArrayLike) -> jax.Array:
     transform = as_floating(transform, (4, 4), "transform")
     w, t = so3.log(transform[..., :3, :3]), transform[..., :3, 3]
     first, second = so3.inverse_coefficients(so3.trigonometry(w))
-    along = jnp.sum(w * t, axis=-1)
-    rho = first[..., None] * t - jnp.cross(w, t) / 2 + (second * along)[..., None] * w
+    along = dot(w, t)
+    rho = first[..., None] * t - cross(w, t) / 2 + (second * along)[..., None] * w
     return jnp.concatenate([w, rho], axis=-1)
 
 

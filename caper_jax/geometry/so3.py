@@ -33,13 +33,21 @@ from caper_jax.geometry.linalg import as_floating, multiply, norm, transpose
 _SERIES_BELOW = 1.0
 _SERIES_TERMS = 12
 
+# hat of the unit vectors. Constants and broadcasting compile to one loop, stacked entries to nine.
+_GENERATORS = np.array(
+    [
+        [[0, 0, 0], [0, 0, -1], [0, 1, 0]],
+        [[0, 0, 1], [0, 0, 0], [-1, 0, 0]],
+        [[0, -1, 0], [1, 0, 0], [0, 0, 0]],
+    ]
+)
+
 
 def hat(w: ArrayLike) -> jax.Array:
     """Skew matrix [..., 3, 3] of a vector [..., 3]: ``hat(w) @ v == cross(w, v)``."""
-    w = as_floating(w, (3,), "w")
-    x, y, z = w[..., 0], w[..., 1], w[..., 2]
-    zero = jnp.zeros_like(x)
-    return _matrix(zero, -z, y, z, zero, -x, -y, x, zero)
+    w = as_floating(w, (3,), "w")[..., None, None]
+    x, y, z = _GENERATORS.astype(w.dtype)
+    return w[..., 0, :, :] * x + w[..., 1, :, :] * y + w[..., 2, :, :] * z
 
 
 def vee(skew: ArrayLike) -> jax.Array:
@@ -58,15 +66,13 @@ def exp(w: ArrayLike) -> jax.Array:
     w = as_floating(w, (3,), "w")
     terms = trigonometry(w)
     first, second, _ = exp_coefficients(terms)
-    squares = [second * w[..., i] ** 2 for i in range(3)]
-    diagonal = []
-    for i in range(3):
-        others = squares[i - 1] + squares[i - 2]
-        # 1 - c (y^2 + z^2) is exact near the identity; for an angle near pi about y or z it
-        # takes nearly 2 from 1, where cos t + c x^2 keeps one more bit.
-        near = terms.small | (others < squares[i])
-        diagonal.append(jnp.where(near, 1 - others, terms.cos + squares[i]))
-    return _rodrigues(w, first, second, diagonal)
+    # The diagonal has two forms. 1 - c (y^2 + z^2) is exact near the identity; for an angle near
+    # pi about y or z it takes nearly 2 from 1, where cos t + c x^2 keeps one more bit.
+    squares = second[..., None] * w * w
+    others = _sum_of_others(squares)
+    near = terms.small[..., None] | (others < squares)
+    diagonal = jnp.where(near, 1 - others, terms.cos[..., None] + squares)
+    return _with_diagonal(diagonal, _off_diagonal(w, first, second))
 
 
 def log(rotation: ArrayLike) -> jax.Array:
@@ -204,8 +210,8 @@ def inverse_coefficients(terms: Trigonometry) -> tuple[jax.Array, jax.Array]:
 def rodrigues(vector: jax.Array, first: jax.Array, second: jax.Array) -> jax.Array:
     """``I + first hat(v) + second hat(v)^2`` [..., 3, 3] of v [..., 3] and two scalars [...]."""
     # hat(v)^2 has the diagonal -(y^2 + z^2), ...: no cancellation for small angles.
-    x, y, z = (second * vector[..., i] ** 2 for i in range(3))
-    return _rodrigues(vector, first, second, (1 - (y + z), 1 - (x + z), 1 - (x + y)))
+    diagonal = 1 - _sum_of_others(second[..., None] * vector * vector)
+    return _with_diagonal(diagonal, _off_diagonal(vector, first, second))
 
 
 def alternating_series(coefficient: Callable[[int], float], terms: Trigonometry) -> jax.Array:
@@ -215,8 +221,11 @@ def alternating_series(coefficient: Callable[[int], float], terms: Trigonometry)
 
 def _squared_length(v: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
     """|v|^2 [...] of [..., 3], rounded, and as an unrounded sum of two parts."""
-    coarse, fine = _split(v)
-    parts = jnp.sum(coarse * coarse, axis=-1), jnp.sum((2 * coarse + fine) * fine, axis=-1)
+    coarse, fine = zip(*(_split(v[..., i]) for i in range(3)), strict=True)
+    parts = (
+        coarse[0] ** 2 + coarse[1] ** 2 + coarse[2] ** 2,
+        sum((2 * c + f) * f for c, f in zip(coarse, fine, strict=True)),
+    )
     return parts[0] + parts[1], parts
 
 
@@ -271,21 +280,18 @@ def _quaternion(r: jax.Array) -> jax.Array:
     return jnp.where(q[..., :1] < 0, -q, q)
 
 
-def _rodrigues(
-    vector: jax.Array, first: jax.Array, second: jax.Array, diagonal: Sequence[jax.Array]
-) -> jax.Array:
-    """``rodrigues`` with its diagonal given."""
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    xy, xz, yz = second * x * y, second * x * z, second * y * z
-    x, y, z = first * x, first * y, first * z
-    return _matrix(
-        *(diagonal[0], xy - z, xz + y),
-        *(xy + z, diagonal[1], yz - x),
-        *(xz - y, yz + x, diagonal[2]),
-    )
+def _off_diagonal(vector: jax.Array, first: jax.Array, second: jax.Array) -> jax.Array:
+    """``first hat(v) + second v v^T`` [..., 3, 3]."""
+    outer = (second[..., None] * vector)[..., :, None] * vector[..., None, :]
+    return outer + hat(first[..., None] * vector)
 
 
-def _matrix(*entries: jax.Array) -> jax.Array:
-    """[..., 3, 3] from nine [...] entries, row by row."""
-    stacked = jnp.stack(entries, axis=-1)
-    return stacked.reshape((*stacked.shape[:-1], 3, 3))
+def _sum_of_others(values: jax.Array) -> jax.Array:
+    """(y + z, z + x, x + y) of (x, y, z) [..., 3]."""
+    values = values[..., None]
+    mask = 1 - np.eye(3, dtype=values.dtype)
+    return values[..., 0, :] * mask[0] + values[..., 1, :] * mask[1] + values[..., 2, :] * mask[2]
+
+
+def _with_diagonal(diagonal: jax.Array, matrix: jax.Array) -> jax.Array:
+    return jnp.where(np.eye(3, dtype=bool), diagonal[..., None], matrix)
