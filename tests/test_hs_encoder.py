@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import HS, quick_jit, random_like
+from tiny import HS, random_like
 
 from caper_jax import categories
 from caper_jax.networks.caper import PartsNetwork, RootNetwork
@@ -96,7 +96,7 @@ def test_encoder_follows_the_formulas(feature_space):
     variables = jax.tree.map(lambda leaf: leaf.astype(np.float64), variables)
     points = np.random.default_rng(1).normal(size=(2, 64, 3))
     with jax.enable_x64(True):
-        result = quick_jit(lambda v, x: module.apply(v, x, train=False))(variables, points)
+        result = jax.jit(lambda v, x: module.apply(v, x, train=False))(variables, points)
     for b in range(2):
         levels, rows, shared = hs_encoder(variables, points[b], config)
         for level, expected in zip(result.levels, levels, strict=True):
@@ -113,7 +113,7 @@ def test_pooling_is_random_in_training_only():
     cloud = np.random.default_rng(1).normal(size=(64, 3)).astype(np.float32)
     points = np.stack([cloud, cloud])
 
-    @quick_jit
+    @jax.jit
     def train(key):
         return module.apply(variables, points, True, rngs={"sample": key}, mutable=["batch_stats"])
 

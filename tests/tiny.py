@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -17,9 +16,6 @@ from caper_jax.training.task import LossConfig, Task
 
 HS = HSEncoderConfig(channels=(4, 4, 8, 8, 16), neighbours=4, supports=2)
 FAST = FastEncoderConfig(centers=16, stride=1, scales=(0.2, 0.4), width=8, blocks=1, last=8)
-
-# LLVM's optimisation is most of a compilation, and no test needs it.
-quick_jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def network(encoder: str = "fast", pool_first: bool = False, **changes: Any) -> NetworkConfig:
