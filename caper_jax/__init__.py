@@ -1,10 +1,11 @@
 """caper_jax: category-level articulated object pose perception in JAX (CAPER++).
 
-    import caper_jax as caper
+Example:
+  import caper_jax as caper
 
-    estimator = caper.load("box")
-    prediction = estimator(points)     # points [B, N, 3] metres, OpenCV camera frame
-    prediction.pose.rotation           # [B, K, 3, 3]
+  estimator = caper.load("box")
+  prediction = estimator(points)  # points [B, N, 3] metres, OpenCV camera frame
+  prediction.pose.rotation  # [B, K, 3, 3]
 """
 
 from caper_jax import articulation, categories, geometry

@@ -1,4 +1,4 @@
-"""The commands in a row: generate, train, resume, fine-tune, evaluate, estimate, on a tiny model."""
+"""The commands in a row: generate, train, fine-tune, evaluate, estimate, on a tiny model."""
 
 from __future__ import annotations
 

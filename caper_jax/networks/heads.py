@@ -51,8 +51,10 @@ class PooledHead(nn.Module):
         if self.config.pool_first:
             rows = features.levels[-1].features
             hidden = jnp.concatenate([rows.max(axis=1), rows.mean(axis=1)], -1)
-            hidden = nn.relu(nn.Dense(first)(hidden))
-            hidden = nn.relu(nn.Dense(second)(hidden))
+            # Leaky: without a norm before them, plain rectifiers can all die in the first steps,
+            # and the head then predicts one constant for every cloud.
+            hidden = nn.leaky_relu(nn.Dense(first)(hidden))
+            hidden = nn.leaky_relu(nn.Dense(second)(hidden))
         else:
             hidden = _norm_relu(BlockDense(first, self.with_points)(features), train)
             hidden = _norm_relu(nn.Dense(second)(hidden), train).max(axis=1)
