@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,7 +116,7 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         started_from, stored = read_model(initial)
         variables = _initial_variables(variables, stored, initial)
         description["initial"] = started_from
-    mesh = parallel.data_mesh() if jax.device_count() > 1 else None
+    mesh = _mesh(batch_size)
     result = fit(
         directory,
         config.training,
@@ -133,6 +134,14 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
             card["started_from"] = started_from
         write_model(directory, variables, card)
     return result
+
+
+def _mesh(batch_size: int) -> jax.sharding.Mesh | None:
+    """All devices; in a single process as many as divide the batch, None for one."""
+    devices = jax.devices()
+    if jax.process_count() == 1:
+        devices = devices[: math.gcd(batch_size, len(devices))]
+    return parallel.data_mesh(devices) if len(devices) > 1 else None
 
 
 def _initial_variables(template: Any, stored: Any, directory: str | Path) -> Any:
