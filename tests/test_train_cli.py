@@ -70,7 +70,7 @@ def test_evaluate_and_estimate_take_the_model(model, tmp_path, capsys):
     out = tmp_path / "pose.json"
     estimate = ["estimate", "--category", "box", "--points", str(points), "--json", str(out)]
     assert cli.main([*estimate, "--weights", str(model)]) == 0
-    assert np.shape(json.loads(out.read_text())["rotation"]) == (2, 3, 3)
+    assert np.shape(json.loads(out.read_text())["pose"]["rotation"]) == (2, 3, 3)
 
 
 def test_a_model_can_start_another_run(model, tmp_path):
