@@ -304,8 +304,7 @@ def test_every_weight_learns(trained):
 def test_training_on_one_batch_lowers_the_loss(trained):
     state, values, _, (new_state, metrics) = trained
     assert np.isfinite(values).all()
-    print(values)
-    assert values[-5:].max() < 0.6 * values[0]
+    assert values[-5:].max() < 0.25 * values[0]
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((new_state, metrics)))
     # The running statistics of both stages move, in their old structure.
     moved = jax.tree.map(lambda new, old: np.abs(new - old).max(), new_state, state)
