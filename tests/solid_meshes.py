@@ -11,13 +11,20 @@ from caper_jax.geometry.solids import Solid
 SECTIONS = 512  # of a circle
 
 
-def _manifold(solid: Solid) -> manifold3d.Manifold:
+def _unit(solid: Solid) -> manifold3d.Manifold:
     if solid.kind == "box":
-        unit = manifold3d.Manifold.cube((2, 2, 2), center=True)
-    else:
-        unit = manifold3d.Manifold.cylinder(2, 1, 1, SECTIONS, center=True)
+        return manifold3d.Manifold.cube((2, 2, 2), center=True)
+    if solid.kind == "ellipsoid":
+        return manifold3d.Manifold.sphere(1, SECTIONS)
+    if solid.kind == "frustum":
+        square = manifold3d.CrossSection.square((2, 2), center=True)
+        return square.extrude(2, scale_top=solid.taper).translate((0, 0, -1))
+    return manifold3d.Manifold.cylinder(2, 1, solid.taper[0], SECTIONS, center=True)
+
+
+def _manifold(solid: Solid) -> manifold3d.Manifold:
     affine = np.concatenate([solid.rotation * solid.half, solid.center[:, None]], axis=1)
-    shape = unit.transform(affine)
+    shape = _unit(solid).transform(affine)
     return shape if solid.hole is None else shape - _manifold(solid.hole)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from caper_jax.articulation.category import Category, ObjectModel
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solids import Solid, bounds
+from caper_jax.geometry.solids import TAPERED, Solid, bounds
 
 # Splits never share an instance: each draws from its own family of seeds.
 SPLITS = {"train": 0, "val": 1, "test": 2}
@@ -26,7 +26,8 @@ class SolidGroup:
       half_axes: [n, M, 3, 3] columns are the solid's half axes (for its corners).
       part: [n, M] int32.
       valid: [n, M] bool; unused slots are False.
-      hole_to_unit, hole_center: the same for the solid cut away, or None.
+      taper: [n, M, 2], or None for kinds that have none.
+      hole_to_unit, hole_center, hole_taper: the same for the solid cut away, or None.
     """
 
     to_unit: Any
@@ -34,8 +35,10 @@ class SolidGroup:
     half_axes: Any
     part: Any
     valid: Any
+    taper: Any = None
     hole_to_unit: Any = None
     hole_center: Any = None
+    hole_taper: Any = None
 
 
 @flax.struct.dataclass
@@ -126,15 +129,18 @@ def build_bank(models: list[ObjectModel]) -> Bank:
 def _empty_group(name: str, count: int, slots: int) -> SolidGroup:
     eye = np.tile(np.eye(3, dtype=np.float32), (count, slots, 1, 1))
     zeros = np.zeros((count, slots, 3), np.float32)
-    hole = "-" in name
+    kind, hole = name.split("-") if "-" in name else (name, None)
+    ones = np.ones((count, slots, 2), np.float32)
     return SolidGroup(
         to_unit=eye.copy(),
         center=zeros.copy(),
         half_axes=np.zeros_like(eye),
         part=np.zeros((count, slots), np.int32),
         valid=np.zeros((count, slots), bool),
+        taper=ones.copy() if kind in TAPERED else None,
         hole_to_unit=eye.copy() if hole else None,
         hole_center=zeros.copy() if hole else None,
+        hole_taper=ones.copy() if hole in TAPERED else None,
     )
 
 
@@ -144,6 +150,10 @@ def _fill_slot(group: SolidGroup, index: int, slot: int, part: int, solid: Solid
     group.half_axes[index, slot] = solid.rotation * solid.half
     group.part[index, slot] = part
     group.valid[index, slot] = True
+    if group.taper is not None:
+        group.taper[index, slot] = solid.taper
     if solid.hole is not None:
         group.hole_to_unit[index, slot] = solid.hole.rotation.T / solid.hole.half[:, None]
         group.hole_center[index, slot] = solid.hole.center
+        if group.hole_taper is not None:
+            group.hole_taper[index, slot] = solid.hole.taper

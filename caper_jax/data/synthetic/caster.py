@@ -27,13 +27,13 @@ def _slab(origin, direction):
     return jnp.minimum(first, second), jnp.maximum(first, second)
 
 
-def _box_interval(origin, direction):
+def _box_interval(origin, direction, taper):
     near, far = zip(*(_slab(o, d) for o, d in zip(origin, direction, strict=True)), strict=True)
     enter = jnp.maximum(jnp.maximum(near[0], near[1]), near[2])
     return enter, jnp.minimum(jnp.minimum(far[0], far[1]), far[2])
 
 
-def _cylinder_interval(origin, direction):
+def _cylinder_interval(origin, direction, taper):
     near, far = _slab(origin[2], direction[2])
     a = direction[0] ** 2 + direction[1] ** 2
     # Distance of the axis from the ray, by the cross product: the usual b^2 - ac cancels in
@@ -48,7 +48,70 @@ def _cylinder_interval(origin, direction):
     return near, jnp.minimum(far, jnp.where(hit, (middle + root) * inverse, -FAR))
 
 
-_INTERVAL = {"box": _box_interval, "cylinder": _cylinder_interval}
+def _ellipsoid_interval(origin, direction, taper):
+    (x, y, z), (u, v, w) = origin, direction
+    a = u**2 + v**2 + w**2
+    discriminant = a - (x * v - y * u) ** 2 - (y * w - z * v) ** 2 - (z * u - x * w) ** 2
+    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
+    middle = -(x * u + y * v + z * w)
+    inverse = 1.0 / jnp.maximum(a, 1e-12)
+    hit = discriminant > 0
+    return (
+        jnp.where(hit, (middle - root) * inverse, FAR),
+        jnp.where(hit, (middle + root) * inverse, -FAR),
+    )
+
+
+def _width(origin, direction, taper):
+    """Half width along a ray, start and slope: 1 at z = -1 and ``taper`` at z = 1."""
+    slope = 0.5 * (taper - 1.0)
+    return 0.5 * (taper + 1.0) + slope * origin[2], slope * direction[2]
+
+
+def _frustum_interval(origin, direction, taper):
+    near, far = _slab(origin[2], direction[2])
+    for axis in (0, 1):
+        width, slope = _width(origin, direction, taper[axis])
+        for side in (-1.0, 1.0):
+            # Inside the half space where distance + depth * rate <= 0.
+            distance, rate = side * origin[axis] - width, side * direction[axis] - slope
+            crossing = -distance / jnp.where(jnp.abs(rate) < 1e-12, 1e-12, rate)
+            near = jnp.where(rate < 0, jnp.maximum(near, crossing), near)
+            far = jnp.where(rate < 0, far, jnp.minimum(far, crossing))
+    return near, far
+
+
+def _cone_interval(origin, direction, taper):
+    near, far = _slab(origin[2], direction[2])
+    (x, y, _), (u, v, _) = origin, direction
+    width, slope = _width(origin, direction, taper[0])
+    # a t^2 + 2 b t + c <= 0 inside; the discriminant b^2 - ac as a sum of cross products.
+    a = u**2 + v**2 - slope**2
+    b = x * u + y * v - width * slope
+    c = x**2 + y**2 - width**2
+    discriminant = (u * width - x * slope) ** 2 + (v * width - y * slope) ** 2
+    discriminant -= (x * v - y * u) ** 2
+    # The two roots without cancellation, one as q / a and one as c / q.
+    q = jnp.maximum(jnp.sqrt(jnp.maximum(discriminant, 0.0)) + jnp.abs(b), 1e-12)
+    one, other = q / jnp.where(jnp.abs(a) < 1e-12, 1e-12, a), c / q
+    enter = jnp.where(b > 0, -one, other)
+    leave = jnp.where(b > 0, -other, one)
+    # A ray steeper than the side (a < 0) crosses the side of this half of the double cone once.
+    across = a >= 0
+    enter = jnp.where(across | (slope > 0), enter, -FAR)
+    leave = jnp.where(across | (slope <= 0), leave, FAR)
+    hit = ~across | (discriminant > 0)
+    near = jnp.maximum(near, jnp.where(hit, enter, FAR))
+    return near, jnp.minimum(far, jnp.where(hit, leave, -FAR))
+
+
+_INTERVAL = {
+    "box": _box_interval,
+    "cylinder": _cylinder_interval,
+    "ellipsoid": _ellipsoid_interval,
+    "frustum": _frustum_interval,
+    "cone": _cone_interval,
+}
 
 
 def _to_unit_frame(to_unit, center, pose, rays):
@@ -80,12 +143,12 @@ def cast(groups: dict[str, SolidGroup], poses, rays):
         def body(carry, solid, kinds=kinds):
             depth, part = carry
             pose = poses[solid.part]
-            frame = _to_unit_frame(solid.to_unit, solid.center, pose, rays)
-            near, far = _INTERVAL[kinds[0]](*frame)
+            origin, direction = _to_unit_frame(solid.to_unit, solid.center, pose, rays)
+            near, far = _INTERVAL[kinds[0]](origin, direction, solid.taper)
             hit = near
             if len(kinds) == 2:
                 frame = _to_unit_frame(solid.hole_to_unit, solid.hole_center, pose, rays)
-                hole_near, hole_far = _INTERVAL[kinds[1]](*frame)
+                hole_near, hole_far = _INTERVAL[kinds[1]](frame[0], frame[1], solid.hole_taper)
                 inside = (hole_near < hole_far) & (near >= hole_near) & (near <= hole_far)
                 hit = jnp.where(inside, hole_far, near)
             better = solid.valid & (near < far) & (hit < far) & (hit > 1e-3) & (hit < depth)
