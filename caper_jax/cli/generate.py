@@ -24,7 +24,9 @@ def build_parser() -> argparse.ArgumentParser:
             ("--category box --frames 3 --images --out frames", "depth images to estimate from"),
         ],
     )
-    parser.add_argument("--category", required=True, help="e.g. box")
+    parser.add_argument(
+        "--category", required=True, help="e.g. box, or FILE.py:NAME for one of your own"
+    )
     parser.add_argument("--split", default="test", choices=("train", "val", "test"))
     parser.add_argument("--frames", type=common.positive_int, default=1000)
     parser.add_argument(

@@ -25,7 +25,9 @@ def build_parser() -> argparse.ArgumentParser:
             ("--category box --set training.learning_rate=1e-3 --steps 500 --out runs/try", ""),
         ],
     )
-    parser.add_argument("--category", required=True, help="e.g. box")
+    parser.add_argument(
+        "--category", required=True, help="e.g. box, or FILE.py:NAME for one of your own"
+    )
     parser.add_argument("--preset", default="fast", help="fast or paper (default: fast)")
     parser.add_argument("--config", type=Path, help="TOML file of settings over the preset's")
     parser.add_argument(

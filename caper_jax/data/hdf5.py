@@ -180,7 +180,7 @@ class Hdf5Dataset:
         for key, wanted in (("category", category), ("split", split)):
             if wanted is not None and facts[key] != wanted:
                 raise CaperError(f"{path}: holds {key} {facts[key]!r}, not {wanted!r}")
-        return categories.get(str(facts["category"]))
+        return categories.registered(str(facts["category"]))
 
 
 def _fields(category: Category) -> list[str]:
