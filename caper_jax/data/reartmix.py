@@ -19,21 +19,16 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image, ImageDraw
-
 from caper_jax import categories
 from caper_jax.articulation.category import Category
-from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.cloud import MIN_POINTS, cloud_from_depth
 from caper_jax.data.images import read_depth, read_intrinsics, read_json
+from caper_jax.data.links import labelled_frame, ordered_links, polygon_labels, pose_of_links
 from caper_jax.data.reartmix_models import CONVERSIONS, Model, read_model
 from caper_jax.data.schema import Frame
 from caper_jax.errors import CaperError, unknown_name
 
 FORMAT = "reartmix"
 ALL = "all"
-_SCALE_TOLERANCE = 1e-3
 _INSTANCE_KEYS = ("id", "category_id", "urdf_id", "links")
 
 
@@ -89,63 +84,15 @@ class ReArtMixDataset:
         annotation = self._annotation(image_name)
         instance = next(i for i in annotation["instances"] if i["id"] == int(instance_id))
         where = f"{self._path(image_name)}, instance {instance_id}"
-        links = _ordered_links(instance, self.category.num_parts, where)
-
-        depth = read_depth(self.root / "depth" / annotation["depth_path"])
-        label_image = _draw_labels(links, depth.shape, where)
-        mask = label_image >= 0
-        points, pixels = np.zeros((0, 3), np.float32), np.zeros((0, 2), np.int32)
-        if np.count_nonzero(mask & (depth > 0)) >= MIN_POINTS:
-            cloud = cloud_from_depth(depth, mask, self._intrinsics, self._num_points)
-            points, pixels = cloud.points, cloud.pixels
-        return Frame(
-            name=name,
-            points=points,
-            labels=label_image[pixels[:, 0], pixels[:, 1]].astype(np.int32),
-            truth=self._truth(instance, links, where),
-            visible=np.bincount(label_image[mask], minlength=self.category.num_parts),
-            depth=depth,
-            mask=mask,
-            intrinsics=self._intrinsics,
-        )
-
-    def _truth(self, instance: dict[str, Any], links: list[dict], where: str) -> ArticulatedPose:
+        keys = ("transformation", "segmentation")
+        links = ordered_links(instance, self.category.num_parts, where, first=1, keys=keys)
         if instance["urdf_id"] not in self._models:
             raise CaperError(f"{where}: urdf_id {instance['urdf_id']} is not in urdf_metas.json")
         model = self._models[instance["urdf_id"]]
-        scales, rotations, shifts = zip(
-            *(_split_transformation(link["transformation"], where) for link in links), strict=True
-        )
-        file_rotation, scale = np.stack(rotations), scales[0]
-        rotation = file_rotation @ model.to_file_rotation
-        moved = np.einsum("kij,kj->ki", file_rotation, model.to_file_shift)
-        translation = np.stack(shifts) + scale * moved
-
-        conversion = self._conversion
-        states = []
-        for j, joint in enumerate(self.category.joints):
-            parent, child = joint.parent, j + 1
-            if joint.type == "revolute":
-                # The files turn the child by minus the state about the stored axis.
-                relative = file_rotation[parent].T @ file_rotation[child]
-                file_state = -_angle_about(relative, model.file_axis[j])
-                state = conversion.sign * (file_state - conversion.rest_state)
-                middle = sum(joint.limits) / 2
-                state = middle + (state - middle + np.pi) % (2 * np.pi) - np.pi
-            else:
-                offset = file_rotation[parent].T @ (shifts[child] - shifts[parent])
-                file_state = float(offset @ model.file_axis[j])
-                state = conversion.sign * (file_state - scale * conversion.rest_state)
-            states.append(state)
-        return ArticulatedPose(
-            rotation=rotation.astype(np.float32),
-            translation=translation.astype(np.float32),
-            size=(scale * model.size).astype(np.float32),
-            box_center=(scale * model.center).astype(np.float32),
-            joint_axis=model.axis.astype(np.float32),
-            joint_pivot=(scale * model.pivot).astype(np.float32),
-            joint_state=np.array(states, np.float32),
-        )
+        truth = pose_of_links(model, links, self.category, where, scaled=True)
+        depth = read_depth(self.root / "depth" / annotation["depth_path"])
+        labels = polygon_labels(links, depth.shape, where)
+        return labelled_frame(name, depth, labels, self._intrinsics, truth, self._num_points)
 
     def _load_models(self) -> dict[int, Model]:
         path = self.root / "urdf_metas.json"
@@ -212,58 +159,3 @@ class ReArtMixDataset:
         if missing:
             raise CaperError(f"{path}: no ReArtMix annotation, it lacks {missing[0]!r}")
         return content
-
-
-def _ordered_links(instance: dict[str, Any], num_parts: int, where: str) -> list[dict[str, Any]]:
-    """The links in the order of the parts; ``link_category_id`` counts from 1."""
-    try:
-        links = {link["link_category_id"] - 1: link for link in instance["links"]}
-        ordered = [links[part] for part in range(num_parts)]
-        for link in ordered:
-            link["transformation"], link["segmentation"]
-    except (KeyError, TypeError) as error:
-        raise CaperError(f"{where}: a link lacks {error}") from error
-    if len(instance["links"]) != num_parts:
-        raise CaperError(f"{where}: {len(instance['links'])} links, expected {num_parts}")
-    return ordered
-
-
-def _split_transformation(value: Any, where: str) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation [3, 3] and translation [3] of ``[s R | t]``."""
-    matrix = np.asarray(value, np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise CaperError(f"{where}: transformation must be 4x4 finite numbers")
-    determinant = np.linalg.det(matrix[:3, :3])
-    if determinant <= 0:
-        raise CaperError(f"{where}: transformation has determinant {determinant:.3g}")
-    scale = float(np.cbrt(determinant))
-    rotation = matrix[:3, :3] / scale
-    drift = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if drift > _SCALE_TOLERANCE:
-        raise CaperError(f"{where}: transformation is no scaled rotation (off by {drift:.2g})")
-    return scale, rotation, matrix[:3, 3]
-
-
-def _draw_labels(links: list[dict[str, Any]], shape: tuple[int, ...], where: str) -> np.ndarray:
-    """[H, W] int: part of every pixel, -1 outside; polygons include their outline."""
-    canvas = Image.new("L", (shape[1], shape[0]), 0)
-    draw = ImageDraw.Draw(canvas)
-    for part, link in enumerate(links):
-        for polygon in link["segmentation"]:
-            if len(polygon) % 2:
-                raise CaperError(f"{where}: a polygon has an odd number of coordinates")
-            if len(polygon) >= 6:
-                draw.polygon(polygon, fill=part + 1)
-    return np.asarray(canvas).astype(np.int64) - 1
-
-
-def _angle_about(rotation: np.ndarray, axis: np.ndarray) -> float:
-    """Signed angle about a unit axis, (-pi, pi], of a rotation [3, 3] about (nearly) that axis."""
-    skew = np.array(
-        [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-        ]
-    )
-    return float(np.arctan2(skew @ axis / 2, (np.trace(rotation) - 1) / 2))
