@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import sys
 import warnings
 from pathlib import Path
 
@@ -12,9 +14,9 @@ import numpy as np
 import pytest
 
 from caper_jax.errors import CaperError
+from caper_jax.model_files import flatten, read_model, unflatten, write_model
 from caper_jax.training import parallel
 from caper_jax.training.checkpoints import Checkpoints, CheckpointWarning
-from caper_jax.training.export import flatten, read_model, unflatten, write_model
 from caper_jax.training.optimizer import Optimizer
 from caper_jax.training.state import TrainState
 
@@ -141,6 +143,20 @@ def test_if_nothing_can_be_read_all_are_named(saved):
     message = r"no checkpoint can be read: .*c/4 .*c/3 .*c/2 "
     with Checkpoints(saved) as checkpoints, pytest.raises(CaperError, match=message):
         checkpoints.restore(make_state(0))
+
+
+def test_a_failed_restore_leaves_nothing_behind(saved, capfd, monkeypatch):
+    """Its other reads once died after the loop had closed, on standard error and in later tests."""
+    reports = []
+    monkeypatch.setattr(sys, "unraisablehook", reports.append)
+    for step in (2, 3, 4):
+        damage(saved / str(step), "no data")
+    for _ in range(8):
+        with Checkpoints(saved) as checkpoints, pytest.raises(CaperError, match="can be read"):
+            checkpoints.restore(make_state(0))
+        gc.collect()
+    assert not reports
+    assert capfd.readouterr() == ("", "")
 
 
 def test_another_model_is_refused_by_leaf(saved):

@@ -7,13 +7,12 @@ step that reads back exactly as it was written, and says what it passed over.
 
 from __future__ import annotations
 
+import asyncio
 import copy
-import gc
 import logging
-import sys
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -120,14 +119,13 @@ class Checkpoints:
         for step in reversed(steps):
             where = self.directory / str(step)
             try:
-                with _quiet():
+                with _quiet(), _orderly_failures():
                     restored = self._read(step, abstract)
             except CaperError:
                 raise
             except Exception as error:  # Orbax and TensorStore raise whatever they please
                 failures.append(f"{where} ({_brief(error)})")
                 self._unreadable.append(step)
-                _drop_failed_reads()
                 continue
             for failure in failures:
                 warnings.warn(
@@ -244,6 +242,31 @@ def _brief(error: Exception) -> str:
     return lines[0].partition(". See full")[0][:200] if lines else type(error).__name__
 
 
+class _PatientLoop(asyncio.SelectorEventLoop):
+    """An event loop that lets its tasks end before it closes."""
+
+    def close(self) -> None:
+        tasks = [] if self.is_closed() else asyncio.all_tasks(self)
+        if tasks:
+            self.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
+        super().close()
+
+
+@contextmanager
+def _orderly_failures() -> Iterator[None]:
+    """Keep the remains of a failed restore off standard error.
+
+    Orbax gives up at the first leaf that fails and closes the loop under the reads of the others,
+    which then report to no one: from TensorStore's threads and, later, from the garbage collector.
+    """
+    new_event_loop = asyncio.new_event_loop
+    asyncio.new_event_loop = _PatientLoop
+    try:
+        yield
+    finally:
+        asyncio.new_event_loop = new_event_loop
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep Orbax's log lines about every save and every odd directory off standard error."""
@@ -254,15 +277,3 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(level)
-
-
-def _drop_failed_reads() -> None:
-    """Collect the coroutines of a failed read, whose errors were reported once already."""
-    hook: Callable[[Any], Any] = sys.unraisablehook
-    sys.unraisablehook = lambda _: None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            gc.collect()
-    finally:
-        sys.unraisablehook = hook
