@@ -17,10 +17,11 @@ from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.configuration import from_dict
-from caper_jax.data.cloud import sample_points
+from caper_jax.data.cloud import MIN_POINTS, sample_points
 from caper_jax.errors import CaperError
 from caper_jax.geometry import se3
 from caper_jax.geometry.directions import rotation_from_directions
+from caper_jax.model_files import CARD_FILE, flatten, read_model
 from caper_jax.networks.canonical import (
     canonicalise,
     multiply,
@@ -30,10 +31,9 @@ from caper_jax.networks.canonical import (
 )
 from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
 from caper_jax.networks.voting import vote
-from caper_jax.training.export import read_model
 
-# Part sizes are residuals to a mean; nothing keeps a regression from going below zero.
-_SMALLEST_SIZE = 1e-4
+# Part sizes are residuals to a mean; nothing else keeps a regression from going below zero.
+_SMALLEST_SIZE = 0.01  # of the mean
 
 
 @flax.struct.dataclass
@@ -106,11 +106,11 @@ def estimate(
         category.joint_types,
         category.parents,
     )
-    size = jnp.asarray(category.mean_size) + parts.size / unit
+    mean_size = jnp.asarray(category.mean_size)
     pose = ArticulatedPose(
         rotation=poses[..., :3, :3],
         translation=poses[..., :3, 3],
-        size=jnp.maximum(size, _SMALLEST_SIZE),
+        size=jnp.maximum(mean_size + parts.size / unit, _SMALLEST_SIZE * mean_size),
         box_center=jnp.asarray(category.mean_center) + parts.center / unit,
         joint_axis=axis,
         joint_pivot=pivot,
@@ -161,29 +161,47 @@ class Estimator:
         Raises:
           CaperError: wrong shape or dtype, fewer than 16 usable points, or points in millimetres.
         """
-        single = np.ndim(points) == 2
         if isinstance(points, jax.core.Tracer):
-            prediction = self.function(self.variables, points[None] if single else points)
+            _check_shape(points.shape)
+            clouds = points if points.ndim == 3 else points[None]
+            prediction = self.function(self.variables, clouds)
         else:
             prediction = self._jitted(self.variables, self._sampled(points))
-        return jax.tree.map(lambda array: array[0], prediction) if single else prediction
+        if np.ndim(points) == 3:
+            return prediction
+        return jax.tree.map(lambda array: array[0], prediction)
 
     def _sampled(self, points) -> np.ndarray:
-        """[B, num_points, 3] float32 from clouds of any size."""
-        clouds = np.asarray(points)
-        if clouds.ndim not in (2, 3) or clouds.shape[-1] != 3:
-            raise CaperError(f"points must be [N, 3] or [B, N, 3], got shape {clouds.shape}")
-        clouds = clouds[None] if clouds.ndim == 2 else clouds
-        if not len(clouds):
-            raise CaperError("points holds no cloud: its batch axis is empty")
+        """[B, num_points, 3] float32 from one cloud or B clouds of any size."""
+        try:
+            clouds = np.asarray(points)
+        except ValueError as error:
+            raise CaperError(
+                f"points is no array ({error}); give clouds of different sizes one at a time"
+            ) from error
+        _check_shape(clouds.shape)
         count = self.network.num_points
+        if clouds.ndim == 2:
+            return sample_points(clouds, count).points[None]
+        names = [f"points[{i}]" if len(clouds) > 1 else "points" for i in range(len(clouds))]
         return np.stack(
             [
-                sample_points(
-                    cloud, count, where=f"points[{i}]" if len(clouds) > 1 else "points"
-                ).points
-                for i, cloud in enumerate(clouds)
+                sample_points(cloud, count, where=name).points
+                for cloud, name in zip(clouds, names, strict=True)
             ]
+        )
+
+
+def _check_shape(shape: tuple[int, ...]) -> None:
+    """Raises CaperError unless the shape is one cloud's or a batch's."""
+    if len(shape) not in (2, 3) or shape[-1] != 3:
+        raise CaperError(f"points must be [N, 3] or [B, N, 3], got shape {shape}")
+    if shape[0] == 0 and len(shape) == 3:
+        raise CaperError("points holds no cloud: its batch axis is empty")
+    if shape[-2] < MIN_POINTS:
+        raise CaperError(
+            f"only {shape[-2]} of {shape[-2]} points in points are usable; at least {MIN_POINTS} "
+            "points of the object are needed"
         )
 
 
@@ -223,20 +241,37 @@ def load(category: str, weights: str | Path | None = None) -> Estimator:
     try:
         sizes = card["run"]["network"]
     except (KeyError, TypeError) as error:
-        raise CaperError(f"{directory / 'model.json'} lacks run.network; train again") from error
-    network = from_dict(NetworkConfig, sizes, str(directory / "model.json"))
+        raise CaperError(f"{directory / CARD_FILE} lacks run.network; train again") from error
+    network = from_dict(NetworkConfig, sizes, str(directory / CARD_FILE))
     _check_variables(directory, variables, definition, network)
     return Estimator(definition, network, variables, card)
 
 
 def _check_variables(directory: Path, variables, category: Category, network: NetworkConfig):
-    """Raises CaperError unless the weights fit the networks of the card."""
-    points = jax.ShapeDtypeStruct((1, network.num_points, 3), jnp.float32)
-    function = partial(estimate, category=category, network=network)
+    """Raises CaperError unless the weights are those of the card's networks, leaf by leaf."""
+    points = jax.ShapeDtypeStruct((2, network.num_points, 3), jnp.float32)
+    key = jax.random.key(0)
+    modules = {"root": RootNetwork(network), "parts": PartsNetwork(network, category.num_parts)}
     try:
-        jax.eval_shape(function, variables, points)
-    except Exception as error:  # Flax raises many kinds; all mean that the two do not fit
+        shapes = {
+            name: jax.eval_shape(partial(module.init, train=False), key, points)
+            for name, module in modules.items()
+        }
+    except Exception as error:  # sizes that build no network; Flax and JAX raise many kinds
         reason = str(error).strip().splitlines()[0]
         raise CaperError(
-            f"{directory}: weights.npz does not fit the network in model.json ({reason})"
+            f"{directory / CARD_FILE}: run.network is no network ({reason})"
         ) from error
+    wanted = {
+        f"{collection}/{name}/{path}": leaf.shape
+        for name, variables_of in shapes.items()
+        for collection, tree in variables_of.items()
+        for path, leaf in flatten(tree).items()
+    }
+    found = {name: leaf.shape for name, leaf in flatten(variables).items()}
+    for name in sorted(wanted.keys() | found.keys()):
+        if wanted.get(name) != found.get(name):
+            raise CaperError(
+                f"{directory}: weights.npz does not fit the network in model.json: {name} is "
+                f"{found.get(name, 'absent')} there, {wanted.get(name, 'absent')} in the network"
+            )

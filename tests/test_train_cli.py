@@ -10,8 +10,8 @@ import pytest
 
 from caper_jax import cli
 from caper_jax.configuration import update
+from caper_jax.model_files import read_model
 from caper_jax.training import run
-from caper_jax.training.export import read_model
 
 ROOT = Path(__file__).resolve().parents[1]
 # A batch that no eight devices can share: compiling for one is faster.

@@ -102,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if prediction.degenerate:
         print("the rotation is arbitrary: the two directions that give it are parallel")
     if arguments.json is not None:
-        from caper_jax.training.export import write_atomically
+        from caper_jax.files import write_atomically
 
         text = json.dumps(_as_json(pose, category, cloud, confidence), indent=2, allow_nan=False)
         write_atomically(arguments.json, text.encode() + b"\n")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -53,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from caper_jax.evaluation import protocol, report
 
     category = categories.get(arguments.category)
-    _check_folder(arguments.out)
+    common.check_folder(arguments.out, "--out")
     dataset = open_dataset(arguments.format, arguments.data, category.name, arguments.split)
     weights = None
     predictor: protocol.Predictor = protocol.truth_predictor
@@ -76,14 +75,3 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(report.format_report(result))
     print(f"\nwritten: {arguments.out / report.METRICS_FILE}, {report.PREDICTIONS_FILE}")
     return 0
-
-
-def _check_folder(folder: Path) -> None:
-    """Refuses, before any work, a folder that cannot be made or written in."""
-    existing = folder
-    while not existing.exists():
-        existing = existing.parent
-    if not existing.is_dir():
-        raise CaperError(f"--out {folder}: {existing} is a file; give a folder")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise CaperError(f"--out {folder}: no permission to write in {existing}")

@@ -21,7 +21,7 @@ from caper_jax.evaluation.metrics import (
     pose_errors_up_to_symmetry,
 )
 from caper_jax.evaluation.protocol import Evaluation
-from caper_jax.training.export import write_atomically
+from caper_jax.files import write_atomically
 
 METRICS_FILE = "metrics.json"
 PREDICTIONS_FILE = "predictions.npz"

@@ -17,10 +17,10 @@ from caper_jax._version import __version__
 from caper_jax.configuration import to_dict
 from caper_jax.data.synthetic.scene import Batch, Generator, GeneratorConfig
 from caper_jax.errors import CaperError, unknown_name
+from caper_jax.model_files import flatten, read_model, write_model
 from caper_jax.networks.caper import NetworkConfig
 from caper_jax.networks.presets import PRESETS as NETWORKS
 from caper_jax.training import parallel
-from caper_jax.training.export import flatten, read_model, write_model
 from caper_jax.training.loop import FitResult, TrainingConfig, fit
 from caper_jax.training.task import LossConfig, Task
 

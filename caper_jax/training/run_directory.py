@@ -9,7 +9,7 @@ from typing import Any
 import jax
 
 from caper_jax.errors import CaperError
-from caper_jax.training.export import write_atomically
+from caper_jax.files import write_atomically
 
 # Keys of the configuration that a resumed run may change: they do not touch the result.
 _FREE_KEYS = frozenset(

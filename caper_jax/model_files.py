@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import zipfile
 import zlib
 from pathlib import Path
@@ -14,6 +13,7 @@ import jax
 import numpy as np
 
 from caper_jax.errors import CaperError
+from caper_jax.files import write_atomically
 
 PyTree = Any
 WEIGHTS_FILE = "weights.npz"
@@ -127,19 +127,6 @@ def unflatten(flat: dict[str, Any], where: str = "variables") -> PyTree:
             raise CaperError(f"{where}: {name!r} is both an array and a group")
         node[last] = leaf
     return tree
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that a kill at any moment leaves the old one or the new one."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _compact(name: str, leaf: Any) -> np.ndarray:
