@@ -18,6 +18,7 @@ from caper_jax.data.synthetic import sensor as sensors
 from caper_jax.data.synthetic.bank import Bank
 from caper_jax.data.synthetic.caster import FAR, cast, projected_bounds
 from caper_jax.data.synthetic.scene import draw_state_and_poses
+from caper_jax.data.synthetic.surroundings import table_depth
 
 
 @dataclass(frozen=True)
@@ -76,14 +77,7 @@ def _render(key, instance: Bank, sensor, category: Category, width: int, height:
     x, y = jnp.meshgrid(x, y, indexing="xy")
     depth, parts = cast(instance.groups, poses, (x.ravel(), y.ravel()))
     depth, parts = depth.reshape(x.shape), parts.reshape(x.shape)
-    # The table: the plane through the lowest point of the root, across the axis that points up.
-    up = "xyz".index(category.viewpoint.up)
-    rotation, translation = poses[0, :3, :3], poses[0, :3, 3]
-    normal = rotation[:, up]
-    lowest = instance.box_center[0, up] - instance.size[0, up] / 2
-    along = normal[0] * x + normal[1] * y + normal[2]
-    table = ((normal * translation).sum() + lowest) / jnp.where(along < -1e-6, along, -1e-6)
-    table = jnp.where((table > 0) & (table < 6.0), table, FAR)
+    table = table_depth(instance, poses, category.viewpoint, (x, y))
     on_table = table < depth
     depth, parts = jnp.where(on_table, table, depth), jnp.where(on_table, -1, parts)
 

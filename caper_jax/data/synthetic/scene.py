@@ -2,54 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from caper_jax.articulation.category import Category, Viewpoint
+from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.data.synthetic import masks
 from caper_jax.data.synthetic import sensor as sensors
 from caper_jax.data.synthetic.bank import Bank, build_bank, draw_models
+from caper_jax.data.synthetic.camera import camera_pose, draw_camera
 from caper_jax.data.synthetic.caster import cast, projected_bounds
-from caper_jax.errors import CaperError
+from caper_jax.data.synthetic.config import GeneratorConfig
+from caper_jax.data.synthetic.surroundings import add_clutter, spill_on_table, table_depth
 
-
-@dataclass(frozen=True)
-class GeneratorConfig:
-    """What the generated frames look like.
-
-    Attributes:
-      instances: shapes in the bank.
-      grid: rays per side over the object's projected box.
-      num_points: points per frame.
-      noise: sensor presets, one drawn per frame (none, gauss3mm, kinect, realsense).
-      occlusion: fraction of frames with a part of the object cut off by something in front.
-      residue: largest fraction of points that belong to something behind the object, as left in
-        by a mask that is too wide; each frame draws its own fraction up to it.
-    """
-
-    instances: int = 2000
-    grid: int = 96
-    num_points: int = 1024
-    noise: tuple[str, ...] = ("kinect",)
-    occlusion: float = 0.0
-    residue: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, low in (("instances", 1), ("grid", 8), ("num_points", 16)):
-            if getattr(self, name) < low:
-                raise CaperError(f"data.{name} must be at least {low}, got {getattr(self, name)}")
-        for name in ("occlusion", "residue"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise CaperError(f"data.{name} is a fraction from 0 to 1")
-        if not self.noise:
-            raise CaperError("data.noise needs at least one preset; use ['none'] for clean depth")
+_MARGIN = 0.04  # of the object's projected box, on each side
 
 
 @flax.struct.dataclass
@@ -60,8 +32,10 @@ class Batch:
       points: [B, N, 3] metres, camera frame, in raster order.
       labels: [B, N] int32 part of each point, -1 for residue.
       pose: ArticulatedPose with leading axis B.
-      visible: [B, K] int32 pixels of each part in the ray grid, before sampling.
+      visible: [B, K] int32 pixels of each part in the mask, before sampling.
       instance: [B] int32 index into the bank.
+      visibility: [B, K] ``visible`` over the pixels that the part would have if nothing, neither
+        another part nor something else, were in front of it; None unless measured.
     """
 
     points: Any
@@ -69,62 +43,7 @@ class Batch:
     pose: ArticulatedPose
     visible: Any
     instance: Any
-
-
-def _look_at(eye, target, up, roll):
-    """Camera pose world -> camera [4, 4] (OpenCV axes), rolled about the viewing direction."""
-    z = target - eye
-    z /= jnp.linalg.norm(z)
-    x = jnp.cross(z, up)
-    x /= jnp.linalg.norm(x)
-    y = jnp.cross(z, x)
-    cos, sin = jnp.cos(roll), jnp.sin(roll)
-    rotation = jnp.stack([cos * x - sin * y, sin * x + cos * y, z])
-    translation = -(rotation * eye).sum(-1)
-    return jnp.eye(4).at[:3, :3].set(rotation).at[:3, 3].set(translation)
-
-
-def _draw_camera(key, view: Viewpoint, diagonal):
-    """World (root canonical) -> camera [4, 4], as conventions ask: see Viewpoint."""
-    # One draw for all: every call of jax.random costs compile time.
-    uniform = jax.random.uniform(key, (10,))
-    low = jnp.radians(jnp.array([view.azimuth[0], view.elevation[0], -view.roll]))
-    high = jnp.radians(jnp.array([view.azimuth[1], view.elevation[1], view.roll]))
-    azimuth, elevation, roll = low + uniform[:3] * (high - low)
-    # Uniform in log distance: relative, as perspective is.
-    nearest, farthest = np.log(view.distance)
-    distance = diagonal * jnp.exp(nearest + uniform[3] * (farthest - nearest))
-    level, height = jnp.cos(elevation), jnp.sin(elevation)
-    around = jnp.array([jnp.sin(azimuth) * level, height, jnp.cos(azimuth) * level])
-    # Canonical axes (x, y, z) cycle so that `up` comes second.
-    shift = {"y": 0, "z": 1, "x": -1}[view.up]
-    eye = jnp.roll(around, shift) * distance
-    up = jnp.zeros(3).at["xyz".index(view.up)].set(1.0)
-    target = (uniform[4:7] - 0.5) * 0.1 * diagonal
-    camera = _look_at(eye, target, up, roll)
-    # The object stands anywhere in the image: turn the camera away from it, keeping its place.
-    # 0.55 and 0.35 are the half widths of a 58 x 39 deg field of view at z = 1; wide cameras
-    # reach 1.2 times that.
-    aside = (2.0 * uniform[7:9] - 1.0) * jnp.array([0.55, 0.35]) * 1.2 * uniform[9]
-    # Keep the whole object in front of the camera at close range.
-    aside *= jnp.minimum(1.0, distance / (3.0 * diagonal))
-    return jnp.matmul(_aside(aside), camera, precision="highest")
-
-
-def _aside(offset):
-    """The shortest rotation [4, 4] that takes the optical axis to (offset, 1)."""
-    direction = jnp.array([offset[0], offset[1], 1.0])
-    direction /= jnp.linalg.norm(direction)
-    x, y, z = direction
-    scale = 1.0 / (1.0 + z)
-    rotation = jnp.array(
-        [
-            [1.0 - x * x * scale, -x * y * scale, x],
-            [-x * y * scale, 1.0 - y * y * scale, y],
-            [-x, -y, z],
-        ]
-    )
-    return jnp.eye(4).at[:3, :3].set(rotation)
+    visibility: Any = None
 
 
 def _systematic(key, hit, count: int):
@@ -139,15 +58,6 @@ def _systematic(key, hit, count: int):
     return jnp.clip(jnp.searchsorted(running, rank, side="left"), 0, hit.shape[0] - 1)
 
 
-def _occluder(key, probability: float, grid: int):
-    """[grid, grid] bool, False where something in front hides the object."""
-    uniform = jax.random.uniform(key, (3,))
-    angle, edge = 2 * jnp.pi * uniform[0], 0.1 + 0.8 * uniform[1]
-    axis = jnp.linspace(-1.0, 1.0, grid)
-    side = jnp.cos(angle) * axis[None, :] + jnp.sin(angle) * axis[:, None]
-    return (side < edge) | (uniform[2] >= probability)
-
-
 def draw_state_and_poses(key, instance: Bank, category: Category):
     """Joint states over the instance's range, and a camera around it.
 
@@ -157,50 +67,101 @@ def draw_state_and_poses(key, instance: Bank, category: Category):
     state_key, camera_key = jax.random.split(key)
     low, high = instance.limits[:, 0], instance.limits[:, 1]
     state = low + jax.random.uniform(state_key, low.shape) * (high - low)
-    box_low = (instance.box_center - instance.size / 2).min(0)
-    box_high = (instance.box_center + instance.size / 2).max(0)
-    diagonal = jnp.linalg.norm(box_high - box_low)
-    poses = forward_kinematics(
-        _draw_camera(camera_key, category.viewpoint, diagonal),
+    diagonal = rest_diagonal(instance)
+    view = category.viewpoint
+    root = camera_pose(draw_camera(camera_key, view), view, diagonal)
+    return state, part_poses(root, instance, state, category), diagonal
+
+
+def rest_diagonal(instance: Bank):
+    """Diagonal of the whole object's box at rest, metres."""
+    low = (instance.box_center - instance.size / 2).min(0)
+    high = (instance.box_center + instance.size / 2).max(0)
+    return jnp.linalg.norm(high - low)
+
+
+def part_poses(root, instance: Bank, state, category: Category):
+    """Poses [..., K, 4, 4] of all parts from the root's [..., 4, 4] and the states [..., J]."""
+    return forward_kinematics(
+        root,
         instance.joint_axis,
         instance.joint_pivot,
         state,
         category.joint_types,
         category.parents,
     )
-    return state, poses, diagonal
 
 
-def render_frame(key, instance: Bank, category: Category, config: GeneratorConfig, mix):
-    """One labelled frame of one instance (Bank without its leading axis); see ``Batch``."""
-    keys = jax.random.split(key, 8)
-    state, poses, diagonal = draw_state_and_poses(keys[0], instance, category)
+class Keys(NamedTuple):
+    """PRNG keys of a frame; a video keeps some of them from frame to frame."""
 
-    low2, high2 = projected_bounds(instance.groups, poses)
-    steps = jnp.arange(config.grid) + 0.0
-    offset = jax.random.uniform(keys[1], (2,))
-    x = low2[0] + (steps + offset[0]) / config.grid * (high2[0] - low2[0])
-    y = low2[1] + (steps + offset[1]) / config.grid * (high2[1] - low2[1])
-    x, y = jnp.meshgrid(x, y, indexing="xy")
-    depth, part = cast(instance.groups, poses, (x.ravel(), y.ravel()))
-    depth, part = depth.reshape(x.shape), part.reshape(x.shape)
-    hit = part >= 0
-    if config.occlusion > 0:
-        kept = hit & _occluder(keys[2], config.occlusion, config.grid)
-        hit = jnp.where(kept.sum() > 0.3 * hit.sum(), kept, hit)
-    sensor = sensors.draw(keys[3], mix)
-    surface = sensors.surface(depth, hit, (x, y))
-    seen = sensors.lose(keys[4], sensor, surface, hit)
+    scene: Any
+    grid: Any
+    mask: Any
+    sensor: Any
+    loss: Any
+    pick: Any
+    noise: Any
+    residue: Any
+
+
+def render_frame(key, instance: Bank, category: Category, config: GeneratorConfig, mix) -> Batch:
+    """One labelled frame of one instance (Bank without its leading axis).
+
+    Returns:
+      Batch without its leading axis; ``instance`` is None.
+    """
+    keys = Keys(*jax.random.split(key, 8))
+    state, poses, _ = draw_state_and_poses(keys.scene, instance, category)
+    return observe(keys, instance, state, poses, category, config, mix)
+
+
+def observe(
+    keys: Keys, instance: Bank, state, poses, category: Category, config: GeneratorConfig, mix
+) -> Batch:
+    """What a depth camera and a mask show of one instance in a given pose.
+
+    Args:
+      keys: PRNG keys (``scene`` is not used).
+      instance: Bank without its leading axis.
+      state: [J] joint states.
+      poses: [K, 4, 4] part rest frame -> camera.
+      category: the instance's category.
+      config: what disturbs the frame.
+      mix: sensors to draw from, ``sensor.sensor_mix(config.noise)``.
+
+    Returns:
+      Batch without its leading axis; ``instance`` is None.
+    """
+    rays = _ray_grid(keys.grid, instance, poses, config)
+    flat = (rays[0].ravel(), rays[1].ravel())
+    depth, part = (image.reshape(rays[0].shape) for image in cast(instance.groups, poses, flat))
+    depth, part, hit = _apply_mask(keys.mask, depth, part, instance, poses, rays, category, config)
+    visible = jnp.stack([(hit & (part == k)).sum() for k in range(category.num_parts)])
+    visibility = None
+    if config.measure_visibility:
+        alone = _pixels_alone(instance, poses, flat, category.num_parts)
+        visibility = visible / jnp.maximum(alone, 1)
+
+    sensor = sensors.draw(keys.sensor, mix)
+    surface = sensors.surface(depth, hit, rays)
+    seen = sensors.lose(keys.loss, sensor, surface, hit)
+    if config.dropout > 0 or config.holes > 0:
+        lost = masks.drop(jax.random.fold_in(keys.loss, 1), hit, config.dropout, config.holes)
+        seen = masks.keep_most(seen & ~lost, seen)
     seen = jnp.where(seen.any(), seen, hit)
 
     # Only the chosen pixels are measured: random numbers are what costs on a CPU.
-    index = _systematic(keys[5], seen.ravel(), config.num_points)
+    index = _systematic(keys.pick, seen.ravel(), config.num_points)
     chosen = jax.tree.map(lambda image: image.ravel()[index], surface)
-    points = sensors.measure(keys[6], sensor, chosen, (x.ravel()[index], y.ravel()[index]))
+    points = sensors.measure(keys.noise, sensor, chosen, (flat[0][index], flat[1][index]))
     labels = part.ravel()[index]
     if config.residue > 0:
-        points, labels = _add_residue(keys[7], points, labels, diagonal, config.residue)
-    visible = jnp.stack([(hit & (part == k)).sum() for k in range(category.num_parts)])
+        diagonal = rest_diagonal(instance)
+        points, labels = _add_residue(keys.residue, points, labels, diagonal, config.residue)
+    if config.depth_scale > 0:
+        error = jax.random.normal(jax.random.fold_in(keys.sensor, 1))
+        points *= 1.0 + config.depth_scale * jnp.clip(error, -3.0, 3.0)
     pose = ArticulatedPose(
         rotation=poses[:, :3, :3],
         translation=poses[:, :3, 3],
@@ -210,7 +171,64 @@ def render_frame(key, instance: Bank, category: Category, config: GeneratorConfi
         joint_pivot=instance.joint_pivot,
         joint_state=state,
     )
-    return points, labels, pose, visible
+    return Batch(points, labels, pose, visible, None, visibility)
+
+
+def _ray_grid(key, instance: Bank, poses, config: GeneratorConfig):
+    """Rays (x [G, G], y [G, G]) over the object's projection, with a random sub-pixel offset."""
+    low, high = projected_bounds(instance.groups, poses)
+    if config.table > 0 or config.clutter > 0:
+        # Room for what a mask that is too wide takes in.
+        low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
+    steps = jnp.arange(config.grid) + 0.0
+    offset = jax.random.uniform(key, (2,))
+    x = low[0] + (steps + offset[0]) / config.grid * (high[0] - low[0])
+    y = low[1] + (steps + offset[1]) / config.grid * (high[1] - low[1])
+    return jnp.meshgrid(x, y, indexing="xy")
+
+
+def _apply_mask(
+    key, depth, part, instance: Bank, poses, rays, category: Category, config: GeneratorConfig
+):
+    """Depth, part and pixels [G, G] that the mask takes for the object."""
+    hit = part >= 0
+    if config.occlusion > 0:
+        hit = masks.occlude(key, hit, config.occlusion, config.occluders)
+    if config.erosion > 0:
+        hit = masks.erode(jax.random.fold_in(key, 2), hit, config.erosion)
+    if config.table > 0 or config.clutter > 0:
+        table = table_depth(instance, poses, category.viewpoint, rays)
+    if config.table > 0:
+        depth, hit = spill_on_table(
+            jax.random.fold_in(key, 3), depth, part, hit, table, config.table, config.spill
+        )
+    if config.clutter > 0:
+        depth, part, hit = add_clutter(
+            jax.random.fold_in(key, 4),
+            depth,
+            part,
+            hit,
+            table,
+            rest_diagonal(instance),
+            rays,
+            config.clutter,
+            config.spill,
+        )
+    return depth, part, hit
+
+
+def _pixels_alone(instance: Bank, poses, rays, num_parts: int):
+    """[K] pixels of each part when all other parts are taken away."""
+
+    def pixels(k):
+        groups = {
+            name: replace(group, valid=group.valid & (group.part == k))
+            for name, group in instance.groups.items()
+        }
+        _, part = cast(groups, poses, rays)
+        return (part >= 0).sum()
+
+    return jax.lax.map(pixels, jnp.arange(num_parts))
 
 
 def _add_residue(key, points, labels, diagonal, largest: float):
@@ -245,7 +263,8 @@ class Generator:
         models = draw_models(category, self.config.instances, split, seed)
         self.bank = jax.tree.map(jnp.asarray, build_bank(models))
         self._mix = sensors.sensor_mix(self.config.noise)
-        self._batch = jax.jit(partial(self.draw, bank=self.bank), static_argnames="batch_size")
+        # The bank is an argument: as a constant it would go through the compiler.
+        self._batch = jax.jit(self.draw, static_argnames="batch_size")
 
     def draw(self, key, batch_size: int, bank: Bank | None = None) -> Batch:
         """Traceable form of ``batch``: call it inside a larger jitted function."""
@@ -254,10 +273,8 @@ class Generator:
         index = jax.random.randint(pick, (batch_size,), 0, bank.num_instances)
         instances = jax.tree.map(lambda values: values[index], bank)
         frame = partial(render_frame, category=self.category, config=self.config, mix=self._mix)
-        points, labels, pose, visible = jax.vmap(frame)(
-            jax.random.split(rest, batch_size), instances
-        )
-        return Batch(points, labels, pose, visible, index)
+        frames = jax.vmap(frame)(jax.random.split(rest, batch_size), instances)
+        return replace(frames, instance=index)
 
     def batch(self, key, batch_size: int) -> Batch:
         """A batch of frames; the same key gives the same batch.
@@ -266,4 +283,4 @@ class Generator:
           key: PRNG key.
           batch_size: B.
         """
-        return self._batch(key, batch_size)
+        return self._batch(key, batch_size=batch_size, bank=self.bank)
