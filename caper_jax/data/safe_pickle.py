@@ -1,0 +1,155 @@
+"""Pickles of numpy arrays and plain containers, read without running what they name.
+
+A pickle is a program: it may import and call anything, and even numpy's own ``__setstate__`` takes
+memory layouts on trust. So nothing that a file names is imported here. Arrays, scalars and dtypes
+are rebuilt from their bytes by this module; beside them only dictionaries, lists, tuples, sets,
+text, bytes and numbers are read.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from caper_jax.errors import CaperError
+
+_NUMBERS = "biufc"
+_TEXTS = "SU"
+
+
+def load(path: str | Path) -> Any:
+    """Reads a pickle (of any protocol, also from Python 2).
+
+    Args:
+      path: the file.
+
+    Returns:
+      Its content: numpy arrays and scalars in plain containers.
+
+    Raises:
+      CaperError: missing or broken file, or one that holds anything else (named).
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaperError(f"{path}: no such file")
+    with path.open("rb") as file:
+        try:
+            return _plain(_Unpickler(file, encoding="latin1").load())
+        except _ForbiddenError as error:
+            raise CaperError(
+                f"{path}: the pickle asks for {error}, but only numpy arrays and plain containers "
+                "are read; do not open this file with other programs unless you trust it"
+            ) from error
+        except Exception as error:  # a broken pickle fails in any way that Python can
+            raise CaperError(f"{path}: broken pickle ({type(error).__name__}: {error})") from error
+
+
+class _ForbiddenError(Exception):
+    """What a pickle may not ask for."""
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str, /) -> Any:
+        place = module.replace("numpy.core.", "numpy._core.")
+        if (place, name) not in _KNOWN:
+            raise _ForbiddenError(f"{module}.{name}")
+        return _KNOWN[place, name]
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise _ForbiddenError(f"an object outside the file ({pid!r})")
+
+
+class _Dtype:
+    """Stands for numpy.dtype while the pickle runs: a kind, a width and a byte order."""
+
+    def __init__(self, code: str, align: bool = False, copy: bool = True):
+        self.code, self.order = code, "|"
+
+    def __setstate__(self, state: tuple) -> None:
+        _, self.order, base, names = state[:4]
+        if base is not None or names is not None:
+            raise _ForbiddenError("a numpy dtype with fields or sub-arrays")
+
+    def real(self) -> np.dtype:
+        dtype = np.dtype(self.order.replace("=", "").replace("|", "") + self.code)
+        if dtype.kind not in _NUMBERS + _TEXTS:
+            raise _ForbiddenError(f"numpy values of dtype {dtype}")
+        return dtype
+
+
+class _Array:
+    """Stands for an array while the pickle runs; the shape and data come as its state."""
+
+    def __init__(self) -> None:
+        self.value = np.zeros(0)
+
+    def __setstate__(self, state: tuple) -> None:
+        _, shape, dtype, by_column, data = state
+        self.value = _from_bytes(data, dtype, shape, "F" if by_column else "C")
+
+
+def _from_bytes(data: Any, dtype: Any, shape: Any, order: str) -> np.ndarray:
+    if not isinstance(dtype, _Dtype):
+        raise _ForbiddenError(f"an array of dtype {dtype!r}")
+    if isinstance(data, str):  # bytes of Python 2
+        data = data.encode("latin1")
+    if not isinstance(data, (bytes, bytearray)):
+        raise _ForbiddenError("an array of Python objects")
+    return np.frombuffer(data, dtype.real()).reshape(shape, order=order).copy()  # type: ignore[call-overload]
+
+
+def _reconstruct(kind: Any, shape: Any, code: Any) -> _Array:
+    return _Array()
+
+
+def _scalar(dtype: Any, data: Any = b"") -> Any:
+    return _from_bytes(data, dtype, (), "C")[()]
+
+
+def _encode(text: str, encoding: str = "latin1") -> bytes:
+    """How old protocols write bytes."""
+    if encoding not in ("latin1", "latin-1"):
+        raise _ForbiddenError(f"text encoded as {encoding!r}")
+    return text.encode("latin1")
+
+
+def _empty() -> bytes:
+    return b""
+
+
+_KNOWN: dict[tuple[str, str], Any] = {
+    ("numpy", "dtype"): _Dtype,
+    ("numpy", "ndarray"): _Array,
+    ("numpy._core.multiarray", "_reconstruct"): _reconstruct,
+    ("numpy._core.multiarray", "scalar"): _scalar,
+    ("numpy._core.numeric", "_frombuffer"): _from_bytes,
+    ("_codecs", "encode"): _encode,
+    ("collections", "OrderedDict"): OrderedDict,
+    **{
+        (module, name): kind
+        for module in ("builtins", "__builtin__")
+        for name, kind in (
+            ("set", set),
+            ("frozenset", frozenset),
+            ("complex", complex),
+            ("bytes", _empty),
+        )
+    },
+}
+
+
+def _plain(value: Any) -> Any:
+    """The value with its arrays in place of what stood for them."""
+    if isinstance(value, _Array):
+        return value.value
+    if isinstance(value, dict):
+        return {_plain(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return type(value)(_plain(item) for item in value)
+    if isinstance(value, (_Dtype, type)) or callable(value):
+        raise _ForbiddenError(f"a bare {getattr(value, '__name__', type(value).__name__)}")
+    return value

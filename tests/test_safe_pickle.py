@@ -1,0 +1,123 @@
+"""Pickles of arrays are read; anything that could run code is refused by name."""
+
+import collections
+import os
+import pickle
+import struct
+
+import numpy as np
+import pytest
+
+from caper_jax.data import safe_pickle
+from caper_jax.errors import CaperError
+
+CONTENT = {
+    "points": [np.arange(6.0).reshape(2, 3), np.asfortranarray(np.arange(6.0).reshape(2, 3))],
+    "pose": (np.float32(0.1), np.array([True, False]), np.array(["a", "bc"]), np.zeros((0, 3))),
+    3: {
+        "big": np.arange(3, dtype=">i4"),
+        "set": {1, 2},
+        "frozen": frozenset("x"),
+        "bytes": b"\xff",
+    },
+    "plain": [1, 2.5, None, True, "text", 1 + 2j, b"", np.array(7)],
+}
+
+
+def assert_same(found, expected):
+    if isinstance(expected, np.ndarray | np.generic):
+        assert found.dtype == expected.dtype
+        np.testing.assert_array_equal(found, expected)
+    elif isinstance(expected, dict):
+        assert list(found) == list(expected)
+        for key in expected:
+            assert_same(found[key], expected[key])
+    elif isinstance(expected, list | tuple):
+        assert type(found) is type(expected) and len(found) == len(expected)
+        for one, other in zip(found, expected, strict=True):
+            assert_same(one, other)
+    else:
+        assert type(found) is type(expected) and found == expected
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_arrays_and_plain_containers_of_every_protocol(tmp_path, protocol):
+    path = tmp_path / "a.pkl"
+    path.write_bytes(pickle.dumps(CONTENT, protocol))
+    assert_same(safe_pickle.load(path), CONTENT)
+
+
+def test_names_of_older_numpy(tmp_path):
+    path = tmp_path / "a.pkl"
+    text = pickle.dumps(np.arange(3.0), 2)
+    assert b"numpy._core.multiarray" in text
+    path.write_bytes(text.replace(b"numpy._core.multiarray", b"numpy.core.multiarray"))
+    assert_same(safe_pickle.load(path), np.arange(3.0))
+
+
+def test_pickles_of_python_2(tmp_path):
+    """Python 2 wrote the bytes of an array as its byte string (opcode SHORT_BINSTRING)."""
+    data = np.array([1.5, -2.0]).tobytes()
+    path = tmp_path / "a.pkl"
+    path.write_bytes(
+        b"\x80\x02cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R"
+        b"(K\x01K\x02\x85cnumpy\ndtype\nU\x02f8K\x00K\x01\x87R(K\x03U\x01<NNNJ\xff\xff\xff\xff"
+        b"J\xff\xff\xff\xffK\x00tb\x89U" + struct.pack("B", len(data)) + data + b"tb."
+    )
+    assert_same(safe_pickle.load(path), np.array([1.5, -2.0]))
+
+
+class Malicious:
+    def __init__(self, call, *arguments):
+        self.reduced = call, arguments
+
+    def __reduce__(self):
+        return self.reduced
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        (lambda path: Malicious(os.system, f"touch {path}"), r"posix\.system|nt\.system"),
+        (lambda path: Malicious(eval, f"open({str(path)!r}, 'w')"), r"builtins\.eval"),
+        (lambda path: [np.zeros(2), {"a": Malicious(open, str(path), "w")}], r"io\.open"),
+        (lambda path: Malicious(getattr, "text", "upper"), r"builtins\.getattr"),
+        (lambda _: np.array([object()]), r"builtins\.object"),
+        (lambda _: np.array([None, 1], object), "array of Python objects|dtype object"),
+        (lambda _: np.zeros(2, [("x", "f4")]), "dtype with fields"),
+        (lambda _: np.zeros(2, "datetime64[s]"), "datetime64"),
+        (lambda _: collections.Counter("ab"), r"collections\.Counter"),
+        (lambda _: np.dtype("f4"), "a bare"),
+        (lambda _: np.matrix, r"numpy\.matrix"),
+    ],
+)
+def test_everything_else_is_refused_by_name(tmp_path, content, named):
+    trace = tmp_path / "it_ran"
+    path = tmp_path / "bad.pkl"
+    path.write_bytes(pickle.dumps(content(trace)))
+    with pytest.raises(CaperError, match=rf"bad\.pkl: .*({named})"):
+        safe_pickle.load(path)
+    assert not trace.exists()
+
+
+def test_layouts_of_memory_are_not_taken_on_trust(tmp_path):
+    """An array of 'O' whose state is raw bytes would make numpy follow forged pointers."""
+    dtype = b"cnumpy\ndtype\nX\x01\x00\x00\x00O\x85R"
+    make = (
+        b"cnumpy._core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85X\x01\x00\x00\x00b\x87R"
+    )
+    path = tmp_path / "bad.pkl"
+    path.write_bytes(b"\x80\x04" + make + b"(K\x01K\x01\x85" + dtype + b"\x89C\x08AAAAAAAAtb.")
+    with pytest.raises(CaperError, match="dtype object"):
+        safe_pickle.load(path)
+
+
+def test_broken_and_missing_files(tmp_path):
+    path = tmp_path / "a.pkl"
+    with pytest.raises(CaperError, match=r"a\.pkl: no such file"):
+        safe_pickle.load(path)
+    whole = pickle.dumps(CONTENT)
+    for content in (b"", whole[:-9], whole[: len(whole) // 2], b"not a pickle", b"\x80\x04P1\n."):
+        path.write_bytes(content)
+        with pytest.raises(CaperError, match=r"a\.pkl: "):
+            safe_pickle.load(path)
