@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
@@ -28,12 +29,18 @@ def along(direction, up) -> np.ndarray:
 
     The two must not be parallel.
     """
-    z = np.asarray(direction, np.float64)
-    z = z / np.sqrt(z @ z)
-    y = up - (up @ z) * z
-    y /= np.sqrt(y @ y)
-    x = np.array([y[1] * z[2] - y[2] * z[1], y[2] * z[0] - y[0] * z[2], y[0] * z[1] - y[1] * z[0]])
-    return np.stack([x, y, z], axis=1)
+    # Plain numbers: numpy's overhead would be most of the time that an instance takes.
+    z = _unit(*map(float, direction))
+    u = tuple(map(float, up))
+    across = z[0] * u[0] + z[1] * u[1] + z[2] * u[2]
+    y = _unit(u[0] - across * z[0], u[1] - across * z[1], u[2] - across * z[2])
+    x = (y[1] * z[2] - y[2] * z[1], y[2] * z[0] - y[0] * z[2], y[0] * z[1] - y[1] * z[0])
+    return np.array([x, y, z]).T
+
+
+def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
+    length = math.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
 
 
 def turned(solid: Solid, rotation: np.ndarray, pivot=(0.0, 0.0, 0.0)) -> Solid:
@@ -65,8 +72,8 @@ def beam(start, end, half, up, taper=None, round_: bool = False) -> Solid:
     """
     start, end = np.asarray(start, np.float64), np.asarray(end, np.float64)
     way = end - start
-    extents = (half[0], half[1], np.sqrt(way @ way) / 2)
-    rotation = along(way, np.asarray(up, np.float64))
+    extents = (half[0], half[1], math.sqrt(way @ way) / 2)
+    rotation = along(way, up)
     center = (start + end) / 2
     if taper is None:
         return (cylinder if round_ else box)(center, extents, rotation)
@@ -91,6 +98,6 @@ def chain(points, half, up, closed: bool = False, round_: bool = False) -> list[
     for index, (start, end) in enumerate(zip(points[: len(ends)], ends, strict=True)):
         size = section(index)
         way = end - start
-        reach = 0.35 * size[0] / np.sqrt(way @ way)
+        reach = 0.35 * size[0] / math.sqrt(way @ way)
         solids.append(beam(start - reach * way, end + reach * way, size, up, None, round_))
     return solids
