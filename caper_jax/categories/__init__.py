@@ -29,6 +29,7 @@ from __future__ import annotations
 from caper_jax.articulation.category import Category
 from caper_jax.categories import user_module
 from caper_jax.categories.box import BOX
+from caper_jax.categories.eyeglasses import EYEGLASSES
 from caper_jax.categories.laptop import LAPTOP
 from caper_jax.errors import CaperError, unknown_name
 
@@ -93,5 +94,5 @@ def get(name: str) -> Category:
     return registered(name)
 
 
-for _category in (BOX, LAPTOP):
+for _category in (BOX, EYEGLASSES, LAPTOP):
     register(_category)
