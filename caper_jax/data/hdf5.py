@@ -24,6 +24,8 @@ FORMAT = "caper"
 FORMAT_VERSION = 1
 _LEVELS = 32767
 _REQUIRED = ("format", "format_version", "category", "split", "mask_source", "units")
+# Fields that a file may lack, and their types.
+_OPTIONAL = {"visibility": "f4", "video": "i4", "frame": "i4", "instance": "i4"}
 
 
 def write(
@@ -35,6 +37,10 @@ def write(
     labels: np.ndarray,
     pose: ArticulatedPose,
     visible: np.ndarray,
+    visibility: np.ndarray | None = None,
+    video: np.ndarray | None = None,
+    frame: np.ndarray | None = None,
+    instance: np.ndarray | None = None,
     names: Sequence[str] | None = None,
     mask_source: str = "simulated",
     attributes: Mapping[str, Any] | None = None,
@@ -50,6 +56,9 @@ def write(
       labels: [F, N] part of every point, -1 unknown.
       pose: arrays [F, K, ...].
       visible: [F, K] points or pixels that show each part.
+      visibility: [F, K] fraction of each part that nothing hides, 0 to 1, where known.
+      video, frame: [F] number of the video and of the frame in it, where the frames are of videos.
+      instance: [F] number of the object shown, where known.
       names: F unique names; numbers by default.
       mask_source: how the object was told from its surroundings.
       attributes: further facts to keep (noise, seed, generator version, ...): text or numbers.
@@ -71,6 +80,10 @@ def write(
     }
     for key in pose_shapes(category.num_parts):
         arrays[key] = np.asarray(getattr(pose, key), np.float32)
+    optional = {"visibility": visibility, "video": video, "frame": frame, "instance": instance}
+    for key, value in optional.items():
+        if value is not None:
+            arrays[key] = np.asarray(value, _OPTIONAL[key])
     _check_arrays(str(path), arrays, category)
     facts = {
         **(attributes or {}),
@@ -116,6 +129,9 @@ class Hdf5Dataset:
 
     Attributes:
       category, format, split, mask_source, names: see ``Dataset``.
+      video, frame: [F] int32 number of the video and of the frame in it; None when the file holds
+        single frames.
+      instance: [F] int32 number of the object shown; None when unknown.
       attributes: everything the file says about itself.
     """
 
@@ -140,13 +156,17 @@ class Hdf5Dataset:
             with h5py.File(path, "r") as file:
                 self.attributes = {key: _plain(value) for key, value in file.attrs.items()}
                 self.category = self._check_attributes(path, category, split)
-                arrays = {key: _read(path, file, key) for key in _fields(self.category)}
+                keys = [*_fields(self.category), *(key for key in _OPTIONAL if key in file)]
+                arrays = {key: _read(path, file, key) for key in keys}
         except OSError as error:
             raise CaperError(f"{path}: truncated or not an HDF5 file ({error})") from error
         _check_arrays(str(path), arrays, self.category)
         self.split = str(self.attributes["split"])
         self.mask_source = str(self.attributes["mask_source"])
         self.names: Sequence[str] = [name.decode() for name in arrays.pop("name")]
+        self.video, self.frame, self.instance = (
+            arrays.pop(key, None) for key in ("video", "frame", "instance")
+        )
         self._arrays = arrays
 
     def __len__(self) -> int:
@@ -163,6 +183,7 @@ class Hdf5Dataset:
                 **{key: arrays[key][index] for key in pose_shapes(self.category.num_parts)}
             ),
             visible=arrays["visible"][index],
+            visibility=arrays["visibility"][index] if "visibility" in arrays else None,
         )
 
     def _check_attributes(self, path: Path, category: str | None, split: str | None) -> Category:
@@ -215,6 +236,9 @@ def _check_arrays(where: str, arrays: dict[str, np.ndarray], category: Category)
         "labels": ((frames, num_points), "i1"),
         "visible": ((frames, parts), "i4"),
     }
+    for key, kind in _OPTIONAL.items():
+        if key in arrays:
+            expected[key] = ((frames, parts) if key == "visibility" else (frames,), kind)
     problems = []
     for key, (shape, kind) in expected.items():
         array = arrays[key]
@@ -234,6 +258,10 @@ def _check_arrays(where: str, arrays: dict[str, np.ndarray], category: Category)
             problems.append(f"labels must be -1 (unknown) to {parts - 1}")
         if (arrays["visible"] < 0).any():
             problems.append("visible must not be negative")
+        visibility = arrays.get("visibility", np.zeros(1))
+        if (visibility < 0).any() or (visibility > 1).any():
+            problems.append("visibility must be fractions from 0 to 1")
+        problems += _video_problems(arrays)
         problems += pose_problems(
             ArticulatedPose(**{key: arrays[key] for key in pose_shapes(parts)}), category
         )
@@ -241,6 +269,18 @@ def _check_arrays(where: str, arrays: dict[str, np.ndarray], category: Category)
             problems.append(f"rotation has {len(arrays['rotation'])} frames, points {frames}")
     if problems:
         raise CaperError(f"{where}: {'; '.join(problems)}")
+
+
+def _video_problems(arrays: dict[str, np.ndarray]) -> list[str]:
+    if ("video" in arrays) != ("frame" in arrays):
+        return ["video and frame must be given together"]
+    if "video" in arrays:
+        pairs = np.stack([arrays["video"], arrays["frame"]], axis=1)
+        if (pairs < 0).any():
+            return ["video and frame must not be negative"]
+        if len(np.unique(pairs, axis=0)) < len(pairs):
+            return ["video and frame name a frame twice"]
+    return []
 
 
 def _read(path: Path, file: h5py.File, key: str) -> np.ndarray:

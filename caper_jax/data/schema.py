@@ -36,6 +36,8 @@ class Frame:
       labels: [N] int32 part of every point, -1 where unknown; None when the data has none.
       truth: pose with arrays [K, ...]; None when the data has none.
       visible: [K] points or pixels that show each part; None when unknown.
+      visibility: [K] fraction of each part that neither other parts nor other objects hide, of
+        what the camera would see of it alone; None when unknown.
       depth: [H, W] float32 metres, for pictures; None when the data has no image.
       mask: [H, W] bool, the object in ``depth``.
       intrinsics: [3, 3] of ``depth``.
@@ -46,6 +48,7 @@ class Frame:
     labels: np.ndarray | None = None
     truth: ArticulatedPose | None = None
     visible: np.ndarray | None = None
+    visibility: np.ndarray | None = None
     depth: np.ndarray | None = None
     mask: np.ndarray | None = None
     intrinsics: np.ndarray | None = None
@@ -213,6 +216,12 @@ def _cloud_problems(frame: Frame, num_parts: int) -> list[str]:
             problems.append(f"visible has shape {visible.shape}, expected ({num_parts},)")
         elif not np.issubdtype(visible.dtype, np.integer) or (visible < 0).any():
             problems.append("visible must be counts, integers from 0 up")
+    if frame.visibility is not None:
+        visibility = np.asarray(frame.visibility)
+        if visibility.shape != (num_parts,):
+            problems.append(f"visibility has shape {visibility.shape}, expected ({num_parts},)")
+        elif not ((visibility >= 0) & (visibility <= 1)).all():
+            problems.append("visibility must be fractions from 0 to 1")
     return problems
 
 

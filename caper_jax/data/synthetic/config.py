@@ -28,7 +28,8 @@ class GeneratorConfig:
       occlusion: rate of frames with a part of the object hidden by something in front.
       occluders: how it hides, one drawn per frame: "edge" all beyond a line, "strip" a band
         across the image, "blob" an ellipse.
-      erosion: rate of frames whose mask is too tight, by 1 to 3 % of the grid's side.
+      erosion: rate of frames whose mask is too tight, by 1 to 3 % of the grid's side; frames that
+        take in the table are spared.
       table: rate of frames whose mask takes in the table along a stretch of the silhouette; the
         table is the plane through the object's lowest point.
       clutter: rate of frames whose mask takes in a blob of another surface, in front of the

@@ -194,14 +194,16 @@ def _apply_mask(
     hit = part >= 0
     if config.occlusion > 0:
         hit = masks.occlude(key, hit, config.occlusion, config.occluders)
-    if config.erosion > 0:
-        hit = masks.erode(jax.random.fold_in(key, 2), hit, config.erosion)
     if config.table > 0 or config.clutter > 0:
         table = table_depth(instance, poses, category.viewpoint, rays)
     if config.table > 0:
         depth, hit = spill_on_table(
             jax.random.fold_in(key, 3), depth, part, hit, table, config.table, config.spill
         )
+    if config.erosion > 0:
+        eroded = masks.erode(jax.random.fold_in(key, 2), hit, config.erosion)
+        # A mask that takes in the table is not too tight.
+        hit = jnp.where((hit & (part < 0)).any(), hit, eroded)
     if config.clutter > 0:
         depth, part, hit = add_clutter(
             jax.random.fold_in(key, 4),
