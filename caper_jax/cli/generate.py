@@ -6,43 +6,81 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from caper_jax.cli import common
 from caper_jax.errors import CaperError
 
+if TYPE_CHECKING:
+    from caper_jax.articulation.category import Category
+    from caper_jax.data.synthetic.config import GeneratorConfig
+
+FRAMES = 1000
 BATCH = 25
+VIDEO_BATCH = 4
 
 
 def build_parser() -> argparse.ArgumentParser:
     parser = common.create_parser(
         "generate",
         "Draws labelled frames of a category from its procedural shapes and writes them to one\n"
-        "HDF5 file. Splits never share an instance; the same arguments give the same frames.",
+        "HDF5 file: single frames, or videos of one object each whose joints move. Splits never\n"
+        "share an instance; the same arguments give the same frames.",
         [
-            ("--category box --split test --frames 1000 --noise kinect --out box_test.h5", ""),
-            ("--category laptop --split val --frames 200 --noise none --out val.h5", ""),
+            ("--category box --out box_test.h5", "1,000 frames of 100 test instances"),
+            ("--category laptop --split val --frames 200 --noise none --out val.h5", "no noise"),
+            ("--category laptop --videos 30 --mode cam --out videos.h5", "moving camera"),
             ("--category box --frames 3 --images --out frames", "depth images to estimate from"),
         ],
     )
     parser.add_argument(
         "--category", required=True, help="e.g. box, or FILE.py:NAME for one of your own"
     )
-    parser.add_argument("--split", default="test", choices=("train", "val", "test"))
-    parser.add_argument("--frames", type=common.positive_int, default=1000)
+    parser.add_argument(
+        "--split",
+        default="test",
+        choices=("train", "val", "test"),
+        help="whose instances (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--frames", type=common.positive_int, help=f"single frames (default: {FRAMES})"
+    )
+    parser.add_argument(
+        "--videos",
+        type=common.positive_int,
+        metavar="N",
+        help="write N videos instead of single frames",
+    )
+    parser.add_argument(
+        "--mode",
+        help="of the videos: paper (static camera, every joint opens), cam (the camera moves too) "
+        "or hard (it moves twice as fast, and the joints reverse) (default: paper)",
+    )
+    parser.add_argument(
+        "--frames-per-video", type=common.positive_int, metavar="T", help="(default: 30)"
+    )
     parser.add_argument(
         "--seed", type=common.non_negative_int, default=0, help="(default: %(default)s)"
     )
     parser.add_argument(
-        "--noise", default="kinect", help="none, gauss3mm, kinect or realsense (default: kinect)"
+        "--noise",
+        default="kinect",
+        help="of the sensor: none, gauss3mm, kinect or realsense (default: %(default)s)",
     )
     parser.add_argument(
-        "--instances", type=common.positive_int, default=100, help="shapes (default: %(default)s)"
+        "--instances",
+        type=common.positive_int,
+        default=100,
+        help="shapes that the frames show (default: %(default)s; with --images one per frame)",
     )
     parser.add_argument(
         "--points", type=common.positive_int, default=4096, help="per frame (default: %(default)s)"
     )
     parser.add_argument(
-        "--grid", type=common.positive_int, default=128, help="rays per side (default: %(default)s)"
+        "--grid",
+        type=common.positive_int,
+        default=128,
+        help="rays per side of the object's box in the image (default: %(default)s)",
     )
     parser.add_argument(
         "--images",
@@ -60,11 +98,25 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
+    _check_options(arguments)
+    arguments.frames = arguments.frames or FRAMES
     if arguments.images:
         _write_images(arguments)
     else:
         _write_file(arguments)
     return 0
+
+
+def _check_options(arguments: argparse.Namespace) -> None:
+    """Refuses options that contradict each other."""
+    if arguments.videos:
+        for option in ("frames", "images"):
+            if getattr(arguments, option):
+                raise CaperError(f"--videos and --{option} exclude each other")
+    else:
+        for option in ("mode", "frames_per_video"):
+            if getattr(arguments, option):
+                raise CaperError(f"--{option.replace('_', '-')} is of videos: add --videos N")
 
 
 def _write_images(arguments: argparse.Namespace) -> None:
@@ -98,13 +150,9 @@ def _write_images(arguments: argparse.Namespace) -> None:
 
 def _write_file(arguments: argparse.Namespace) -> None:
     """Labelled clouds, one HDF5 file."""
-    import jax
-    import numpy as np
-
-    from caper_jax import categories
+    from caper_jax import __version__, categories
     from caper_jax.data import hdf5
-    from caper_jax.data.synthetic.scene import Generator, GeneratorConfig
-    from caper_jax.progress import progress
+    from caper_jax.data.synthetic.config import GeneratorConfig
 
     category = categories.get(arguments.category)
     hdf5.check_writable(arguments.out, arguments.overwrite)
@@ -113,21 +161,10 @@ def _write_file(arguments: argparse.Namespace) -> None:
         grid=arguments.grid,
         num_points=arguments.points,
         noise=(arguments.noise,),
+        measure_visibility=True,
     )
-    generator = Generator(category, config, arguments.split, arguments.seed)
-    key = jax.random.key(arguments.seed)
-    parts = []
-    with progress("generating", total=arguments.frames) as bar:
-        for start in range(0, arguments.frames, BATCH):
-            count = min(BATCH, arguments.frames - start)
-            batch = generator.batch(jax.random.fold_in(key, start), BATCH)
-            parts.append(jax.tree.map(lambda array, n=count: np.asarray(array)[:n], batch))
-            bar.update(count)
-    batch = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
-    names = [
-        f"{category.name}_{arguments.split}{instance:04d}_{index:06d}"
-        for index, instance in enumerate(batch.instance)
-    ]
+    draw = _draw_videos if arguments.videos else _draw_frames
+    batch, fields, attributes = draw(category, config, arguments)
     hdf5.write(
         arguments.out,
         category=category,
@@ -136,13 +173,68 @@ def _write_file(arguments: argparse.Namespace) -> None:
         labels=batch.labels,
         pose=batch.pose,
         visible=batch.visible,
-        names=names,
+        visibility=batch.visibility,
+        instance=batch.instance,
+        **fields,
         attributes={
+            "generator": __version__,
             "noise": arguments.noise,
             "seed": arguments.seed,
             "instances": arguments.instances,
             "grid": arguments.grid,
+            **attributes,
         },
         overwrite=arguments.overwrite,
     )
-    print(f"written: {arguments.out} ({arguments.frames} frames of {arguments.points} points)")
+    count = f"{len(batch.points)} frames of {arguments.points} points"
+    if arguments.videos:
+        count = f"{arguments.videos} videos, {count}"
+    print(f"written: {arguments.out} ({count})")
+
+
+def _draw_frames(category: Category, config: GeneratorConfig, arguments: argparse.Namespace):
+    """Single frames: a Batch [F, ...] of numpy arrays, their names, and nothing more to say."""
+    from caper_jax.data.synthetic.scene import Generator
+
+    generator = Generator(category, config, arguments.split, arguments.seed)
+    batch = _collect(generator.batch, arguments.seed, arguments.frames, BATCH)
+    names = [
+        f"{category.name}_{arguments.split}{instance:04d}_{index:06d}"
+        for index, instance in enumerate(batch.instance)
+    ]
+    return batch, {"names": names}, {}
+
+
+def _draw_videos(category: Category, config: GeneratorConfig, arguments: argparse.Namespace):
+    """Videos one after the other: a Batch [V T, ...], their names and numbers, and the mode."""
+    import jax
+    import numpy as np
+
+    from caper_jax.data.synthetic.videos import FRAMES as LENGTH
+    from caper_jax.data.synthetic.videos import VideoGenerator
+
+    mode, length = arguments.mode or "paper", arguments.frames_per_video or LENGTH
+    generator = VideoGenerator(category, config, mode, length, arguments.split, arguments.seed)
+    batch = _collect(generator.batch, arguments.seed, arguments.videos, VIDEO_BATCH)
+    batch = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), batch)
+    video, frame = np.divmod(np.arange(arguments.videos * length), length)
+    names = [f"{v:05d}/{f:06d}" for v, f in zip(video, frame, strict=True)]
+    return batch, {"names": names, "video": video, "frame": frame}, {"mode": mode}
+
+
+def _collect(draw, seed: int, total: int, size: int):
+    """``total`` frames or videos as numpy arrays, drawn ``size`` at a time."""
+    import jax
+    import numpy as np
+
+    from caper_jax.progress import progress
+
+    key = jax.random.key(seed)
+    parts = []
+    with progress("generating", total=total) as bar:
+        for start in range(0, total, size):
+            count = min(size, total - start)
+            batch = draw(jax.random.fold_in(key, start), size)
+            parts.append(jax.tree.map(lambda array, n=count: np.asarray(array)[:n], batch))
+            bar.update(count)
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)

@@ -169,6 +169,15 @@ class Hdf5Dataset:
         )
         self._arrays = arrays
 
+    @property
+    def videos(self) -> dict[str, list[int]]:
+        """Name of every video -> indices of its frames, in the order of time; {} for frames."""
+        videos: dict[str, list[int]] = {}
+        if self.video is not None and self.frame is not None:
+            for index in np.lexsort((self.frame, self.video)):
+                videos.setdefault(f"{self.video[index]:05d}", []).append(int(index))
+        return videos
+
     def __len__(self) -> int:
         return len(self.names)
 
