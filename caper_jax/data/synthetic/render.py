@@ -53,10 +53,48 @@ def render_image(
     Raises:
       CaperError: unknown noise preset.
     """
-    sensor = jax.tree.map(lambda values: values[0], sensors.sensor_mix((noise,)))
+    sensor = _sensor(noise)
     depth, parts, intrinsics, pose = _render(key, instance, sensor, category, width, height)
     pose = jax.tree.map(np.asarray, pose)
     return Image(np.asarray(depth), np.asarray(parts), np.asarray(intrinsics, np.float64), pose)
+
+
+def render_pose(
+    key,
+    instance: Bank,
+    state,
+    poses,
+    category: Category,
+    noise: str,
+    intrinsics: np.ndarray,
+    width: int = 640,
+    height: int = 480,
+) -> Image:
+    """One instance on a table, in given poses before a given camera.
+
+    Args:
+      key: PRNG key of the sensor's noise.
+      instance: Bank without its leading axis.
+      state: [J] joint states that the poses have.
+      poses: [K, 4, 4] part rest frame -> camera.
+      category: its category.
+      noise: sensor preset.
+      intrinsics: [3, 3] pixels, without skew.
+      width, height: pixels.
+
+    Raises:
+      CaperError: unknown noise preset.
+    """
+    camera = jnp.asarray(intrinsics, jnp.float32)
+    depth, parts = _look(
+        key, instance, poses, _sensor(noise), camera, category, width=width, height=height
+    )
+    pose = jax.tree.map(np.asarray, _pose(instance, state, poses))
+    return Image(np.asarray(depth), np.asarray(parts), np.asarray(intrinsics, np.float64), pose)
+
+
+def _sensor(noise: str):
+    return jax.tree.map(lambda values: values[0], sensors.sensor_mix((noise,)))
 
 
 @partial(jax.jit, static_argnames=("category", "width", "height"))
@@ -72,8 +110,20 @@ def _render(key, instance: Bank, sensor, category: Category, width: int, height:
     center = jnp.array([width, height]) / 2 + jax.random.uniform(
         keys[2], (2,), minval=-0.01, maxval=0.01
     ) * jnp.array([width, height])
-    x = (jnp.arange(width) - center[0]) / focal
-    y = (jnp.arange(height) - center[1]) / focal
+    intrinsics = jnp.array([[focal, 0.0, center[0]], [0.0, focal, center[1]], [0.0, 0.0, 1.0]])
+    depth, parts = _look(
+        keys[3], instance, poses, sensor, intrinsics, category, width=width, height=height
+    )
+    return depth, parts, intrinsics, _pose(instance, state, poses)
+
+
+@partial(jax.jit, static_argnames=("category", "width", "height"))
+def _look(
+    key, instance: Bank, poses, sensor, intrinsics, category: Category, width: int, height: int
+):
+    """Measured depth [H, W] and parts [H, W] of an object in given part poses, and its table."""
+    x = (jnp.arange(width) - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (jnp.arange(height) - intrinsics[1, 2]) / intrinsics[1, 1]
     x, y = jnp.meshgrid(x, y, indexing="xy")
     depth, parts = cast(instance.groups, poses, (x.ravel(), y.ravel()))
     depth, parts = depth.reshape(x.shape), parts.reshape(x.shape)
@@ -83,11 +133,14 @@ def _render(key, instance: Bank, sensor, category: Category, width: int, height:
 
     hit = depth < FAR
     surface = sensors.surface(depth, hit, (x, y))
-    noise_key, loss_key = jax.random.split(keys[3])
+    noise_key, loss_key = jax.random.split(key)
     seen = sensors.lose(loss_key, sensor, surface, hit)
     measured = sensors.measure(noise_key, sensor, surface, (x, y))[..., 2]
-    intrinsics = jnp.array([[focal, 0.0, center[0]], [0.0, focal, center[1]], [0.0, 0.0, 1.0]])
-    pose = ArticulatedPose(
+    return jnp.where(seen, measured, 0.0), jnp.where(seen, parts, -1)
+
+
+def _pose(instance: Bank, state, poses) -> ArticulatedPose:
+    return ArticulatedPose(
         rotation=poses[:, :3, :3],
         translation=poses[:, :3, 3],
         size=instance.size,
@@ -96,7 +149,6 @@ def _render(key, instance: Bank, sensor, category: Category, width: int, height:
         joint_pivot=instance.joint_pivot,
         joint_state=state,
     )
-    return jnp.where(seen, measured, 0.0), jnp.where(seen, parts, -1), intrinsics, pose
 
 
 def write_frame(folder: str | Path, image: Image, category: Category, name: str) -> None:
