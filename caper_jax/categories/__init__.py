@@ -29,8 +29,10 @@ from __future__ import annotations
 from caper_jax.articulation.category import Category
 from caper_jax.categories import user_module
 from caper_jax.categories.box import BOX
+from caper_jax.categories.cutter import CUTTER
 from caper_jax.categories.eyeglasses import EYEGLASSES
 from caper_jax.categories.laptop import LAPTOP
+from caper_jax.categories.stapler import STAPLER
 from caper_jax.errors import CaperError, unknown_name
 
 __all__ = ["get", "names", "register", "registered"]
@@ -94,5 +96,5 @@ def get(name: str) -> Category:
     return registered(name)
 
 
-for _category in (BOX, EYEGLASSES, LAPTOP):
+for _category in (BOX, CUTTER, EYEGLASSES, LAPTOP, STAPLER):
     register(_category)
