@@ -491,7 +491,6 @@ def test_scissors_are_moved_by_their_base_joints_and_turned(tmp_path, quarters, 
     base = ("0.5 0.3 0.7", text(aligned))
     write_object(tmp_path, 5, [joint], points, {1: 0.0}, base)
     model = read_model(tmp_path, 5, category)
-    # Without a procedural shape, positive opens about +y: the frame of the above.
     np.testing.assert_allclose(model.axis, [[0, 1, 0]], atol=1e-9)
     assert model.signs == -sense
     for k in range(2):

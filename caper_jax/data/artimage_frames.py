@@ -9,8 +9,8 @@ front, temples reach back from the lenses. That the official rest pose is ours (
 dishwasher open by 90 deg, drawers closed, glasses unfolded) is assumed, not verified.
 
 Scissors are aligned one by one in the official files, to a frame that no public source states.
-They are turned so that the joint axis is y and the tips, the side on which the two blades are
-slimmer about the pivot, lie along x; their rest pose is the file's, whose opening is not known to
+They are turned so that the joint axis is y and the tips, the side on which the two parts are
+slimmer, lie along x; their rest pose is the file's, whose opening is not known to
 be our 20 deg. Objects of other categories are taken to be in our frame.
 """
 
@@ -96,7 +96,7 @@ def canonical_reading(rest: Rest, category: Category, where: str) -> Reading:
     """
     identity = Reading(np.eye(3), tuple(range(category.num_parts)), np.ones(category.num_joints))
     if category.name == "scissors":
-        return _scissors_reading(rest, category, where)
+        return _scissors_reading(rest, where)
     rule = _UPRIGHT.get(category.name)
     if rule is None or len(rule.axes) != category.num_joints:
         return identity
@@ -130,8 +130,8 @@ def canonical_reading(rest: Rest, category: Category, where: str) -> Reading:
     return Reading(turn, tuple(order.tolist()), np.sign(cosines))
 
 
-def _scissors_reading(rest: Rest, category: Category, where: str) -> Reading:
-    """x to the tips, y along the pivot, positive opens."""
+def _scissors_reading(rest: Rest, where: str) -> Reading:
+    """x to the tips, y along the pivot; positive opens, about +y."""
     axis = rest.axis[0]
     # Any frame with the axis as its second direction.
     helper = np.eye(3)[np.abs(axis).argmin()]
@@ -150,23 +150,23 @@ def _scissors_reading(rest: Rest, category: Category, where: str) -> Reading:
         others = np.delete(np.eye(3), np.abs(axis).argmax(), axis=0) @ plane.T
         nearest = others[np.abs(others @ vectors[:, 1]).argmax()]
         candidates = [nearest, -nearest]
-    tips = min(candidates, key=lambda ahead: _width(everything, ahead))
+    tips = min(candidates, key=lambda ahead: sum(_width(part, ahead) for part in flat))
 
     aside = np.array([tips[1], -tips[0]])  # axis x tips, in the plane's coordinates
     gap = np.diff([part[(part @ tips).argmax()] @ aside for part in flat])[0]
     opening = np.sign(gap) if np.abs(gap) > 0.02 * length else rest.opening[0]
-    expected = 1.0
-    if category.shape is not None:
-        expected = np.sign(category.shape(np.random.default_rng(0)).axis[0, 1])
-    x, y = tips @ plane, expected * opening * axis
+    x, y = tips @ plane, opening * axis
     return Reading(np.stack([x, y, np.cross(x, y)]), (0, 1), np.array([opening]))
 
 
-def _width(flat: np.ndarray, ahead: np.ndarray) -> float:
-    """How far the outer half of scissors reaches to the sides, seen along ``ahead`` [2]."""
-    along = flat @ ahead
-    outer = flat[along > 0.5 * along.max()]
-    return float(np.abs(outer @ np.array([ahead[1], -ahead[0]])).max())
+def _width(part: np.ndarray, ahead: np.ndarray) -> float:
+    """Width of the outer half of one blade [n, 2] on the side ``ahead`` [2] of the pivot."""
+    along = part @ ahead
+    outer = part[along > 0.5 * along.max()]
+    if len(outer) == 0:
+        return 0.0
+    middle = (outer.min(0) + outer.max(0)) / 2
+    return float(np.ptp(outer @ np.array([middle[1], -middle[0]])) / np.linalg.norm(middle))
 
 
 def _about_y(angle: float) -> np.ndarray:
