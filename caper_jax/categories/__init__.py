@@ -32,6 +32,7 @@ from caper_jax.categories.box import BOX
 from caper_jax.categories.cutter import CUTTER
 from caper_jax.categories.eyeglasses import EYEGLASSES
 from caper_jax.categories.laptop import LAPTOP
+from caper_jax.categories.robotarm import ROBOTARM
 from caper_jax.categories.stapler import STAPLER
 from caper_jax.errors import CaperError, unknown_name
 
@@ -96,5 +97,5 @@ def get(name: str) -> Category:
     return registered(name)
 
 
-for _category in (BOX, CUTTER, EYEGLASSES, LAPTOP, STAPLER):
+for _category in (BOX, CUTTER, EYEGLASSES, LAPTOP, ROBOTARM, STAPLER):
     register(_category)
