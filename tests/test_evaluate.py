@@ -83,6 +83,29 @@ def test_the_truth_scores_perfectly_from_file_to_report(path, tmp_path, capsys):
     assert max(map(len, table.splitlines()[:-1])) <= 80
 
 
+def test_errors_by_occlusion(tmp_path, estimator, capsys):
+    """Table 8's bins, by the hidden share of the part itself; the bounds 0 and 1 are inside."""
+    hidden = np.resize([0.0, 0.39, 0.4, 0.79, 0.8, 1.0], FRAMES)
+    visibility = np.stack([1 - hidden, np.ones(FRAMES)], -1).astype(np.float32)
+    path = tmp_path / "box.h5"
+    frames = random_frames(FRAMES, 1500)
+    write(path, category=BOX, split="test", visibility=visibility, **frames)
+    assert run(path, tmp_path / "out") == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    saved = np.load(tmp_path / "out" / "predictions.npz")
+    np.testing.assert_array_equal(saved["visibility"], visibility)
+    distance = np.linalg.norm(saved["t"] - saved["truth_t"], axis=-1)
+    places = np.resize([0, 0, 1, 1, 2, 2], FRAMES)
+    for number, content in enumerate(metrics["by_occlusion"]):
+        base, lid = content["parts"]
+        chosen = places == number
+        assert base["frames"] == chosen.sum()
+        assert base["translation_m"]["mean"] == pytest.approx(distance[chosen, 0].mean(), rel=1e-4)
+        assert lid["frames"] == (FRAMES if number == 0 else 0)
+        assert ("translation_m" in lid) == (number == 0)
+    assert "80-100 %" in capsys.readouterr().out
+
+
 def test_every_figure_can_be_computed_from_the_predictions(path, tmp_path, estimator):
     """SciPy and NumPy on predictions.npz and the dataset alone."""
     assert run(path, tmp_path) == 0
@@ -226,7 +249,7 @@ def test_clouds_are_spread_over_all_points(path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--format", "artimage"], "unknown format 'artimage'"),
+        (["--format", "artimages"], "unknown format 'artimages'"),
         (["--category", "bxo"], "unknown category 'bxo'; did you mean 'box'"),
         (["--split", "train"], "holds split 'test', not 'train'"),
         (["--data", "absent.h5"], "absent.h5: no such file"),

@@ -104,7 +104,7 @@ def test_generated_batches_are_split_and_do_not_depend_on_the_number_of_devices(
 
 def test_batches_from_the_host_are_split():
     batch = host_batch(1)
-    placed = parallel.place(batch, parallel.batch_sharding(parallel.data_mesh()))
+    placed = parallel.place_rows(batch, parallel.data_mesh())
     for name, value in batch.items():
         np.testing.assert_array_equal(placed[name], value)
         for index, shard in enumerate(placed[name].addressable_shards):
@@ -146,7 +146,9 @@ def run(directory, stop_at=None):
     def batches(step):
         if step == stop_at and jax.process_index() == 0:
             signal.raise_signal(signal.SIGTERM)
-        return host_batch(100 + step)
+        count = BATCH // jax.process_count()
+        rows = slice(jax.process_index() * count, (jax.process_index() + 1) * count)
+        return jax.tree.map(lambda values: values[rows], host_batch(100 + step))
 
     config = TrainingConfig(batch_size=BATCH, learning_rate=0.02, warmup=3, steps=12, log_steps=4)
     return fit(directory, config, fed_loss, variables(), batches=batches)

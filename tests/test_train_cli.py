@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -36,6 +38,30 @@ def test_a_run_leaves_a_model_with_its_card(model):
     lines = [json.loads(line) for line in (model / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [5, 10]
     assert lines[1]["loss"] < lines[0]["loss"]
+
+
+def test_a_file_feeds_a_run_that_resumes_where_it_was(tmp_path, capsys):
+    """Six steps in one go and in two end with the same weights."""
+    file = tmp_path / "box.h5"
+    make = ["generate", "--category", "box", "--split", "train", "--frames", "7", "--grid", "24"]
+    assert cli.main([*make, "--points", "256", "--out", str(file)]) == 0
+    feed = ["train", *TINY, "--set", "training.checkpoint_steps=2", "--data", str(file)]
+    steps = ["--steps", "6", "--out"]
+    assert cli.main([*feed, *steps, str(tmp_path / "one")]) == 0
+    card, variables = read_model(tmp_path / "one")
+    assert card["run"]["loader"]["root"] == str(file) and card["steps"] == 6
+
+    assert cli.main([*feed, *steps, str(tmp_path / "two")]) == 0
+    for step in ("4", "6"):  # as if killed after step 2
+        shutil.rmtree(tmp_path / "two" / "checkpoints" / step)
+    assert cli.main([*feed, *steps, str(tmp_path / "two")]) == 0
+    jax.tree.map(np.testing.assert_array_equal, read_model(tmp_path / "two")[1], variables)
+
+    capsys.readouterr()
+    assert cli.main([*feed, "--split", "val", *steps, str(tmp_path / "three")]) == 2
+    assert "holds split 'train', not 'val'" in capsys.readouterr().err
+    assert cli.main(["train", *TINY, "--format", "caper", *steps, str(tmp_path / "four")]) == 2
+    assert "--format goes with --data" in capsys.readouterr().err
 
 
 def test_another_configuration_in_the_same_folder_is_refused(model, capsys):

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from caper_jax.cli import common
+from caper_jax.data import FORMATS
 from caper_jax.errors import CaperError
 
 PREDICTORS = ("model", "truth", "mean")
@@ -25,8 +26,13 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--category", required=True, help="category of the objects, e.g. box")
     parser.add_argument("--data", required=True, type=Path, help="dataset's root folder or .h5")
-    parser.add_argument("--format", required=True, help="layout of the data: caper or reartmix")
+    parser.add_argument("--format", required=True, help=f"layout of the data: {', '.join(FORMATS)}")
     parser.add_argument("--split", help="split to read (default: all there is)")
+    parser.add_argument(
+        "--official-split",
+        action="store_true",
+        help="tell train from test by the published object ids, not by the lists of the root",
+    )
     parser.add_argument(
         "--predictor",
         default="model",
@@ -53,7 +59,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     category = categories.get(arguments.category)
     common.check_folder(arguments.out, "--out")
-    dataset = open_dataset(arguments.format, arguments.data, category.name, arguments.split)
+    dataset = open_dataset(
+        arguments.format,
+        arguments.data,
+        category.name,
+        arguments.split,
+        arguments.official_split,
+    )
     weights = None
     predictor: protocol.Predictor = protocol.truth_predictor
     if arguments.predictor != "truth":

@@ -7,8 +7,13 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from caper_jax.cli import common
+from caper_jax.errors import CaperError
+
+if TYPE_CHECKING:
+    from caper_jax.training.run import RunConfig
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -22,6 +27,7 @@ def build_parser() -> argparse.ArgumentParser:
             ("--category box --config configs/fast.toml --minutes 30 --out runs/box", ""),
             ("--category box --from runs/box --minutes 10 --out runs/box2", "goes on from a model"),
             ("--category laptop --preset paper --steps 1000 --out runs/paper", ""),
+            ("--category box --data ROOT --format artimage --out runs/own", "your own data"),
             ("--category box --set training.learning_rate=1e-3 --steps 500 --out runs/try", ""),
         ],
     )
@@ -45,6 +51,13 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="start from the weights of this model instead of random ones",
     )
+    parser.add_argument(
+        "--data",
+        type=Path,
+        help="a dataset's folder or .h5 file to train on instead of generated frames",
+    )
+    parser.add_argument("--format", help="layout of --data (default: caper)")
+    parser.add_argument("--split", help="split of --data (default: train)")
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument(
         "--minutes", type=common.positive_float, help="length of the run in minutes"
@@ -69,6 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     config = run.preset(arguments.preset, arguments.category)
     if arguments.config is not None:
         config = update(config, arguments.config)
+    config = _with_dataset(config, arguments)
     config = override(config, *arguments.overrides)
     budget = {"minutes": arguments.minutes, "steps": arguments.steps}
     if any(value is not None for value in budget.values()):
@@ -85,3 +99,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         return common.EXIT_INTERRUPTED
     print(f"trained {steps} steps; model written to {arguments.out}")
     return 0
+
+
+def _with_dataset(config: RunConfig, arguments: argparse.Namespace) -> RunConfig:
+    """The configuration with --data, --format and --split in it."""
+    from caper_jax.data.loader import LoaderConfig
+
+    if arguments.data is None:
+        for option in ("format", "split"):
+            if getattr(arguments, option) is not None:
+                raise CaperError(f"--{option} goes with --data")
+        return config
+    source = LoaderConfig(arguments.format or "caper", str(arguments.data))
+    if arguments.split is not None:
+        source = dataclasses.replace(source, split=arguments.split)
+    return dataclasses.replace(config, loader=source)

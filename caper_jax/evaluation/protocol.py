@@ -36,6 +36,7 @@ class Evaluation:
       estimate: arrays [F, K, ...]; NaN where ``failed``.
       truth: arrays [F, K, ...].
       failed: [F] bool: too few points, or an estimate that is not finite.
+      visibility: [F, K] share of each part that nothing hides; NaN where the data do not say.
       seconds_per_frame: time of the predictor alone, after a first call that compiles.
     """
 
@@ -43,6 +44,7 @@ class Evaluation:
     estimate: ArticulatedPose
     truth: ArticulatedPose
     failed: np.ndarray
+    visibility: np.ndarray
     seconds_per_frame: float
 
 
@@ -71,6 +73,8 @@ def evaluate(
     names: list[str] = []
     estimates: list[ArticulatedPose] = []
     truths: list[ArticulatedPose] = []
+    visibility: list[np.ndarray] = []
+    unknown = np.full(dataset.category.num_parts, np.nan)
     seconds, warm = 0.0, False
     with progress("evaluating", total=count) as bar:
         for start in range(0, count, batch_size):
@@ -85,6 +89,7 @@ def evaluate(
             seconds += time.perf_counter() - began
             names += [frame.name for frame in frames]
             truths += [_truth(frame, dataset.category) for frame in frames]
+            visibility += [unknown if f.visibility is None else f.visibility for f in frames]
             for i, frame in enumerate(frames):
                 pose = jax.tree.map(lambda array, i=i: array[i], batch)
                 estimates.append(_checked(pose, frame, dataset.category))
@@ -96,6 +101,7 @@ def evaluate(
         estimate=estimate,
         truth=truth,
         failed=np.isnan(estimate.rotation).any((-1, -2, -3)),
+        visibility=np.stack(visibility),
         seconds_per_frame=seconds / (batches * batch_size),
     )
 

@@ -25,6 +25,9 @@ from caper_jax.files import write_atomically
 
 METRICS_FILE = "metrics.json"
 PREDICTIONS_FILE = "predictions.npz"
+# Bins of paper Table 8: the share of a part that is occluded, low to high. (The paper defines its
+# level as the visible share, yet calls 80-100 % highly occluded and finds it worst.)
+_OCCLUSION = ((0.0, 0.4), (0.4, 0.8), (0.8, 1.0))
 _STATE_UNITS = {"revolute": "degrees", "prismatic": "metres"}
 
 
@@ -33,9 +36,10 @@ def summarise(
 ) -> dict[str, Any]:
     """The content of metrics.json: counts, and mean and median of every error.
 
-    Failed frames are in every mean and median, with the values that "failure_value" names. For a
-    category with declared equivalences, "up_to_symmetry" holds the same errors against the better
-    reading of the truth; "parts" and "joints" never do.
+    Failed frames are in every mean and median, with the values that "failure_value" names. Where
+    the data say how much of each part is visible, "by_occlusion" holds the errors of the parts
+    within each bin of paper Table 8. For a category with declared equivalences, "up_to_symmetry"
+    holds the same errors against the better reading of the truth; "parts" and "joints" never do.
 
     Args:
       evaluation: from ``protocol.evaluate``.
@@ -45,6 +49,7 @@ def summarise(
     """
     category = dataset.category
     arguments = (evaluation.estimate, evaluation.truth, category, evaluation.failed)
+    errors = pose_errors(*arguments)
     report = {
         "category": category.name,
         "format": dataset.format,
@@ -52,12 +57,16 @@ def summarise(
         "frames": len(evaluation.names),
         "failures": int(evaluation.failed.sum()),
         "mask_source": dataset.mask_source,
-        **_tables(pose_errors(*arguments), category),
+        **_tables(errors, category),
         "seconds_per_frame": evaluation.seconds_per_frame,
         "predictor": predictor,
         "weights": weights,
         "failure_value": FAILURE_VALUES,
     }
+    if not np.isnan(evaluation.visibility).all():
+        # Rounded: files keep float32, whose 0.6 is a little more than 0.6.
+        occlusion = np.round(1.0 - evaluation.visibility, 6)
+        report["by_occlusion"] = _by_occlusion(errors, occlusion, category)
     if category.equivalences:
         report["up_to_symmetry"] = {
             "reasons": [equivalence.reason for equivalence in category.equivalences],
@@ -82,6 +91,30 @@ def _tables(errors: PoseErrors, category: Category) -> dict[str, list[dict[str, 
     return {"parts": parts, "joints": joints}
 
 
+def _by_occlusion(
+    errors: PoseErrors, occlusion: np.ndarray, category: Category
+) -> list[dict[str, Any]]:
+    """Errors of the parts by how much of them is hidden; a part without frames in a bin has none.
+
+    Args:
+      errors: of F frames.
+      occlusion: [F, K] hidden share of each part, NaN where unknown.
+      category: names the parts.
+    """
+    bins = []
+    for low, high in _OCCLUSION:
+        inside = (occlusion >= low) & ((occlusion < high) | (high == 1.0))
+        parts = []
+        for k, name in enumerate(category.parts):
+            chosen = inside[:, k]
+            part: dict[str, Any] = {"name": name, "frames": int(chosen.sum())}
+            if chosen.any():
+                part |= {key: _summary(getattr(errors, key)[chosen, k]) for key in PART_METRICS}
+            parts.append(part)
+        bins.append({"occluded": [low, high], "parts": parts})
+    return bins
+
+
 def _summary(values: np.ndarray) -> dict[str, float | None]:
     """Mean and median; None where the error has no meaning (pivots of prismatic joints)."""
     if np.isnan(values).all():
@@ -99,8 +132,8 @@ def write_report(folder: str | Path, evaluation: Evaluation, report: dict[str, A
     predictions.npz holds, for F frames in order, ``frame`` (names), ``failed`` [F] and the
     estimates ``R`` [F, K, 3, 3], ``t``, ``size``, ``box_center`` [F, K, 3] (metres),
     ``joint_axis``, ``joint_pivot`` [F, J, 3], ``joint_state`` [F, J] (radians or metres), NaN where
-    failed, and the ground truth under the same names with ``truth_`` before: every error in
-    metrics.json can be computed from it.
+    failed, and the ground truth under the same names with ``truth_`` before; ``visibility`` [F, K]
+    is NaN where unknown. Every error in metrics.json can be computed from it.
 
     Args:
       folder: exists.
@@ -110,6 +143,7 @@ def write_report(folder: str | Path, evaluation: Evaluation, report: dict[str, A
     arrays: dict[str, np.ndarray] = {
         "frame": np.array(evaluation.names),
         "failed": evaluation.failed,
+        "visibility": evaluation.visibility,
     }
     for prefix, pose in (("", evaluation.estimate), ("truth_", evaluation.truth)):
         for name, key in (
@@ -141,11 +175,28 @@ def format_report(report: dict[str, Any]) -> str:
         "",
         *_format_tables(report),
     ]
+    if "by_occlusion" in report:
+        lines += ["", "by the share of the part that is occluded:"]
+        lines += _format_occlusion(report["by_occlusion"])
     if "up_to_symmetry" in report:
         symmetric = report["up_to_symmetry"]
         lines += ["", f"up to symmetry ({'; '.join(symmetric['reasons'])}):"]
         lines += _format_tables(symmetric)
     return "\n".join(lines)
+
+
+def _format_occlusion(bins: list[dict[str, Any]]) -> list[str]:
+    rows = [["part", "occluded", "frames", "rotation [deg]", "translation [mm]"]]
+    for number in range(len(bins[0]["parts"])):
+        for content in bins:
+            low, high = content["occluded"]
+            part = content["parts"][number]
+            cells = ["-", "-"]
+            if part["frames"]:
+                cells = [_cell(part["rotation_deg"], 1, 2), _cell(part["translation_m"], 1000, 1)]
+            share = f"{100 * low:.0f}-{100 * high:.0f} %"
+            rows.append([part["name"], share, str(part["frames"]), *cells])
+    return align(rows)
 
 
 def _format_tables(tables: dict[str, Any]) -> list[str]:

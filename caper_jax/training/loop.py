@@ -136,8 +136,8 @@ def fit(
       variables: initial variables of the network; on resume their shapes and dtypes.
       batch_fn: ``(key) -> batch`` or ``(key, data) -> batch``, traced into the step.
       data: arrays handed to ``batch_fn`` besides the key, kept on the device.
-      batches: instead of ``batch_fn``: ``(step) -> batch`` on the host, global and the same on
-        every process; a function of the step, so that a resumed run sees the same data.
+      batches: instead of ``batch_fn``: ``(step) -> batch`` on the host, of which each process
+        gives its own rows; a function of the step, so that a resumed run sees the same data.
       mesh: devices to split the batch over; one device without it.
       description: what else defines the run (network, data); kept in config.json and compared
         on resume. Must be JSON-serialisable.
@@ -167,7 +167,7 @@ def fit(
         if batches is None:
             return data
         batch = batches(step)
-        return batch if mesh is None else parallel.place(batch, parallel.batch_sharding(mesh))
+        return batch if mesh is None else parallel.place_rows(batch, mesh)
 
     with (
         Checkpoints(directory / "checkpoints", keep=config.keep_checkpoints) as checkpoints,

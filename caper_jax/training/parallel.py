@@ -100,6 +100,14 @@ def place(tree: PyTree, sharding: jax.sharding.Sharding) -> PyTree:
     return jax.tree.map(put, tree)
 
 
+def place_rows(tree: PyTree, mesh: jax.sharding.Mesh) -> PyTree:
+    """The global batch from each process's own rows of it, numpy arrays [B / processes, ...]."""
+    sharding = batch_sharding(mesh)
+    return jax.tree.map(
+        lambda leaf: jax.make_array_from_process_local_data(sharding, np.asarray(leaf)), tree
+    )
+
+
 def agree(values: Sequence[float]) -> list[float]:
     """What process 0 holds, on every process: decisions that hang on a clock or a signal."""
     if jax.process_count() == 1:

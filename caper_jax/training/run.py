@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import platform
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,10 @@ import numpy as np
 
 from caper_jax import categories
 from caper_jax._version import __version__
+from caper_jax.articulation.category import Category
 from caper_jax.configuration import to_dict
+from caper_jax.data import open_dataset
+from caper_jax.data.loader import LabelledClouds, Loader, LoaderConfig
 from caper_jax.data.synthetic.scene import Batch, Generator, GeneratorConfig
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.model_files import flatten, read_model, write_model
@@ -24,6 +29,7 @@ from caper_jax.training import parallel
 from caper_jax.training.loop import FitResult, TrainingConfig, fit
 from caper_jax.training.task import LossConfig, Task
 
+_SAMPLE = 512  # frames that give the trivial predictor of the model card
 # Every sensor, some occlusion and residue: what a network must bear that has only seen generated
 # data when it meets a real camera.
 TRAINING_DATA = GeneratorConfig(
@@ -43,6 +49,7 @@ class RunConfig:
       category: name of a registered category.
       network: sizes.
       data: generated frames.
+      loader: a dataset to train on instead of generated frames.
       loss: weights and targets.
       training: optimiser and budget.
     """
@@ -50,6 +57,7 @@ class RunConfig:
     category: str
     network: NetworkConfig
     data: GeneratorConfig = TRAINING_DATA
+    loader: LoaderConfig | None = None
     loss: LossConfig = LossConfig()
     training: TrainingConfig = TrainingConfig(minutes=60.0)
 
@@ -102,13 +110,7 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
       CaperError: see ``training.loop.fit``.
     """
     category = categories.get(config.category)
-    generator = Generator(category, config.data, split="train", seed=config.training.seed)
     task = Task(category, config.network, config.loss)
-    batch_size = config.training.batch_size
-
-    def batch_fn(key, bank):
-        return generator.draw(key, batch_size, bank)
-
     description = to_dict(config)
     description.pop("training")
     variables, started_from = task.init(jax.random.key(config.training.seed)), None
@@ -116,24 +118,54 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         started_from, stored = read_model(initial)
         variables = _initial_variables(variables, stored, initial)
         description["initial"] = started_from
-    mesh = _mesh(batch_size)
-    result = fit(
-        directory,
-        config.training,
-        task.loss,
-        variables,
-        batch_fn=batch_fn,
-        data=generator.bank,
-        mesh=mesh,
-        description=description,
+    mesh = _mesh(config.training.batch_size)
+    fit_task = partial(
+        fit, directory, config.training, task.loss, variables, mesh=mesh, description=description
     )
+    sample: Batch | LabelledClouds
+    if config.loader is None:
+        result, sample = _fit_generated(fit_task, config, category)
+    else:
+        result, sample = _fit_dataset(fit_task, config, config.loader)
     if result.finished and jax.process_index() == 0:
-        variables = jax.device_get(result.state.variables)
-        card = _card(config, generator, result)
+        card = _card(config, result, sample)
         if started_from is not None:
             card["started_from"] = started_from
-        write_model(directory, variables, card)
+        write_model(directory, jax.device_get(result.state.variables), card)
     return result
+
+
+def _fit_generated(
+    fit_task: Callable[..., FitResult], config: RunConfig, category: Category
+) -> tuple[FitResult, Batch]:
+    """Trains on endless generated frames; also some of them."""
+    generator = Generator(category, config.data, split="train", seed=config.training.seed)
+    batch_size = config.training.batch_size
+
+    def batch_fn(key, bank):
+        return generator.draw(key, batch_size, bank)
+
+    result = fit_task(batch_fn=batch_fn, data=generator.bank)
+    return result, generator.batch(jax.random.key(config.training.seed), _SAMPLE)
+
+
+def _fit_dataset(
+    fit_task: Callable[..., FitResult], config: RunConfig, source: LoaderConfig
+) -> tuple[FitResult, LabelledClouds]:
+    """Trains on a dataset; also some of its frames."""
+    dataset = open_dataset(source.format, source.root, config.category, source.split)
+    arguments = (config.network.num_points, config.training.seed)
+    with Loader(
+        dataset,
+        config.training.batch_size,
+        *arguments,
+        workers=source.workers,
+        prefetch=source.prefetch,
+        cache_gib=source.cache_gib,
+    ) as loader:
+        result = fit_task(batches=loader)
+    with Loader(dataset, min(_SAMPLE, len(dataset)), *arguments, process=(0, 1), prefetch=0) as one:
+        return result, one(0)
 
 
 def _mesh(batch_size: int) -> jax.sharding.Mesh | None:
@@ -156,7 +188,7 @@ def _initial_variables(template: Any, stored: Any, directory: str | Path) -> Any
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), stored)
 
 
-def mean_pose(batch: Batch) -> dict[str, Any]:
+def mean_pose(batch: Batch | LabelledClouds) -> dict[str, Any]:
     """The trivial predictor: means of the training distribution, JSON-ready.
 
     Returns:
@@ -179,9 +211,8 @@ def mean_pose(batch: Batch) -> dict[str, Any]:
     }
 
 
-def _card(config: RunConfig, generator: Generator, result: FitResult) -> dict[str, Any]:
+def _card(config: RunConfig, result: FitResult, sample: Batch | LabelledClouds) -> dict[str, Any]:
     """The model card: what was trained on what, where, and for how long."""
-    sample = generator.batch(jax.random.key(config.training.seed), 512)
     state = result.state
     return {
         "category": config.category,
