@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from caper_jax.cli import common
+from caper_jax.cli import common, generate_layout
 from caper_jax.errors import CaperError
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ def build_parser() -> argparse.ArgumentParser:
             ("--category laptop --split val --frames 200 --noise none --out val.h5", "no noise"),
             ("--category laptop --videos 30 --mode cam --out videos.h5", "moving camera"),
             ("--category box --frames 3 --images --out frames", "depth images to estimate from"),
+            ("--category box --frames 50 --layout artimage --out root", "a root as of ArtImage"),
         ],
     )
     parser.add_argument(
@@ -88,8 +89,12 @@ def build_parser() -> argparse.ArgumentParser:
         help="write whole images on a table instead: a folder per frame with depth.png, mask.png, "
         "intrinsics.json and truth.json, each of another instance",
     )
+    generate_layout.add_arguments(parser)
     parser.add_argument(
-        "--out", required=True, type=Path, help="the file, e.g. box_test.h5 (a folder: --images)"
+        "--out",
+        required=True,
+        type=Path,
+        help="the file, e.g. box_test.h5 (a folder: --images, --layout)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
     return parser
@@ -100,7 +105,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
     _check_options(arguments)
     arguments.frames = arguments.frames or FRAMES
-    if arguments.images:
+    if arguments.layout:
+        generate_layout.write_layout(arguments)
+    elif arguments.images:
         _write_images(arguments)
     else:
         _write_file(arguments)
