@@ -9,7 +9,7 @@ Layout of a root folder, read unchanged::
 
 The files keep a uniform scale s in every transformation, ``[s R | t]``, and hold the parts at a
 state of their own; frames come out in this project's conventions (metres, rest-canonical frames,
-positive states open).
+positive states open). What is known of rest poses and what is judged: reartmix_models.py.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.data.images import read_depth, read_intrinsics, read_json
 from caper_jax.data.links import labelled_frame, ordered_links, polygon_labels, pose_of_links
-from caper_jax.data.reartmix_models import CONVERSIONS, Model, read_model
+from caper_jax.data.reartmix_models import Model, conversion_of, read_model
 from caper_jax.data.schema import Frame
-from caper_jax.errors import CaperError, unknown_name
+from caper_jax.errors import CaperError
 
 FORMAT = "reartmix"
 ALL = "all"
@@ -52,7 +52,8 @@ class ReArtMixDataset:
 
         Args:
           root: the folder that holds annotations/, depth/ and urdf_metas.json.
-          category: name of the category to read; the others in the images are left out.
+          category: our name of the category to read (``scissors`` are ``scissor`` in the files);
+            the others in the images are left out.
           split: "train" or "test" for the instances of <split>.txt; None or "all" for all.
           num_points: points per frame.
 
@@ -62,9 +63,7 @@ class ReArtMixDataset:
         """
         self.root = Path(root)
         self.category: Category = categories.get(category)
-        if category not in CONVERSIONS:
-            raise unknown_name("ReArtMix category", category, CONVERSIONS)
-        self._conversion = CONVERSIONS[category]
+        self._conversion = conversion_of(self.category.name, "ReArtMix")
         for name in ("annotations", "depth"):
             if not (self.root / name).is_dir():
                 raise CaperError(f"{self.root}: no ReArtMix folder (it lacks {name}/)")
@@ -100,7 +99,7 @@ class ReArtMixDataset:
         models = {}
         try:
             for meta in content["urdf_metas"]:
-                if meta["category_name"] == self.category.name:
+                if meta["category_name"] in self._conversion.file_names:
                     where = f"{path}, model {meta['id']}"
                     models[meta["id"]] = read_model(meta, self.category, self._conversion, where)
         except (KeyError, TypeError, ValueError, IndexError) as error:
