@@ -1,0 +1,164 @@
+"""An articulated object in one reference pose: meshes of the parts and joint lines beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from caper_jax.data.urdf.load import UrdfModel, joint_motion
+from caper_jax.data.urdf.meshes import Mesh, join
+from caper_jax.data.urdf.parts import PartTree
+
+_DIRECTIONS = 48  # of a half circle, over which widths are averaged
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Parts and joints in one frame that all parts share in the reference pose; metres.
+
+    Attributes:
+      parts: K meshes.
+      kinds: J times "revolute" or "prismatic".
+      parents: J parts; joint j carries part j + 1.
+      axis: [J, 3] unit vectors.
+      pivot: [J, 3] points on the axes.
+      limits: [J, 2] radians or metres from the reference pose; may be infinite.
+    """
+
+    parts: tuple[Mesh, ...]
+    kinds: tuple[str, ...]
+    parents: tuple[int, ...]
+    axis: np.ndarray
+    pivot: np.ndarray
+    limits: np.ndarray
+
+    @property
+    def num_joints(self) -> int:
+        return len(self.kinds)
+
+    def poses(self, states: Sequence[float] | np.ndarray) -> np.ndarray:
+        """[K, 4, 4] of the parts in the root's frame, at states from the reference pose."""
+        poses = [np.eye(4)]
+        for joint, parent in enumerate(self.parents):
+            motion = joint_motion(
+                self.kinds[joint], self.axis[joint], self.pivot[joint], states[joint]
+            )
+            poses.append(poses[parent] @ motion)
+        return np.stack(poses)
+
+    def at(self, states: np.ndarray) -> Reference:
+        """The same object with another reference pose; states count from there."""
+        poses = self.poses(states)
+        carriers = poses[list(self.parents)]
+        return Reference(
+            tuple(mesh.moved(pose) for mesh, pose in zip(self.parts, poses, strict=True)),
+            self.kinds,
+            self.parents,
+            np.einsum("jab,jb->ja", carriers[:, :3, :3], self.axis),
+            np.einsum("jab,jb->ja", carriers[:, :3, :3], self.pivot) + carriers[:, :3, 3],
+            self.limits - np.asarray(states)[:, None],
+        )
+
+    def moved(self, pose: np.ndarray, scale: float = 1.0) -> Reference:
+        """In another frame (old -> new [4, 4]), then with all lengths times ``scale``."""
+        sliding = np.array([kind == "prismatic" for kind in self.kinds], bool)
+        return Reference(
+            tuple(mesh.moved(pose).scaled(scale) for mesh in self.parts),
+            self.kinds,
+            self.parents,
+            self.axis @ pose[:3, :3].T,
+            scale * (self.pivot @ pose[:3, :3].T + pose[:3, 3]),
+            self.limits * np.where(sliding, scale, 1.0)[:, None],
+        )
+
+    def flipped(self, signs: np.ndarray) -> Reference:
+        """With the axes of the joints with sign -1 turned round, and their limits with them."""
+        limits = np.where(signs[:, None] < 0, -self.limits[:, ::-1], self.limits)
+        return Reference(
+            self.parts, self.kinds, self.parents, self.axis * signs[:, None], self.pivot, limits
+        )
+
+    def ordered(self, order: Sequence[int]) -> Reference:
+        """With joint ``order[j]`` as joint j; for joints that all hang on the root."""
+        rows = list(order)
+        return Reference(
+            (self.parts[0], *(self.parts[row + 1] for row in rows)),
+            tuple(self.kinds[row] for row in rows),
+            self.parents,
+            self.axis[rows],
+            self.pivot[rows],
+            self.limits[rows],
+        )
+
+    def exchanged(self) -> Reference:
+        """Two parts, the other one the root: seen from its child, a joint turns the other way."""
+        return Reference(
+            self.parts[::-1], self.kinds, self.parents, -self.axis, self.pivot, self.limits
+        )
+
+    def bounds(self) -> np.ndarray:
+        """[2, 3] corners of the whole object's box."""
+        boxes = np.array([mesh.bounds() for mesh in self.parts])
+        return np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
+
+    def across(self, joint: int) -> np.ndarray:
+        """[2, 3] orthonormal, e1 x e2 = axis: the plane in which a revolute joint turns."""
+        axis = self.axis[joint]
+        first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+        first /= np.linalg.norm(first)
+        return np.stack([first, np.cross(axis, first)])
+
+    def direction(self, part: int, joint: int) -> np.ndarray:
+        """[3] unit vector across a joint's axis, away from it, along which a part is longest."""
+        plane = self.across(joint)
+        _, mean, second = self.parts[part].moments()
+        longest = np.linalg.eigh(plane @ second @ plane.T)[1][:, -1] @ plane
+        away = mean - self.pivot[joint]
+        return longest if longest @ away >= 0 else -longest
+
+    def turn(self, joint: int, start: np.ndarray, end: np.ndarray) -> float:
+        """Angle in (-pi, pi] about a joint's axis from one direction to another."""
+        plane = self.across(joint)
+        (a, b), (c, d) = plane @ start, plane @ end
+        return float(np.arctan2(a * d - b * c, a * c + b * d))
+
+    def width(self, joint: int, state: float) -> float:
+        """How far a joint's two parts reach together, metres, at one of its states.
+
+        Along a slide; in the plane of a turn, the mean over all directions.
+        """
+        motion = joint_motion(self.kinds[joint], self.axis[joint], self.pivot[joint], state)
+        child = self.parts[joint + 1].moved(motion)
+        points = np.concatenate([self.parts[self.parents[joint]].vertices, child.vertices])
+        if self.kinds[joint] == "prismatic":
+            along = points @ self.axis[joint]
+            return float(np.ptp(along))
+        angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+        directions = np.stack([np.cos(angles), np.sin(angles)], -1) @ self.across(joint)
+        return float(np.ptp(points @ directions.T, axis=0).mean())
+
+
+def reference(model: UrdfModel, tree: PartTree) -> Reference:
+    """The object as the file holds it at state 0, in the frame of the file's root link."""
+    poses = model.link_poses(tree.locked)
+    parts = []
+    for links in tree.links:
+        meshes = [(model.links[name], poses[name]) for name in links]
+        parts.append(join([mesh.moved(pose) for mesh, pose in meshes if mesh is not None]))
+    axes, pivots, limits = [], [], []
+    for part in tree.joints:
+        frame = poses[part.joint.parent] @ part.joint.origin
+        # Seen from its child, a joint turns the other way.
+        axes.append(frame[:3, :3] @ part.joint.axis * (-1.0 if part.reversed else 1.0))
+        pivots.append(frame[:3, 3])
+        limits.append(part.joint.limits)
+    return Reference(
+        tuple(parts),
+        tuple(part.joint.kind for part in tree.joints),
+        tuple(part.parent for part in tree.joints),
+        np.array(axes),
+        np.array(pivots),
+        np.array(limits),
+    )
