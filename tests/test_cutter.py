@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from solid_points import inside, loose, sample
+from solid_points import inside, loose
 
 from caper_jax import categories
 from caper_jax.data.synthetic.bank import draw_models
@@ -32,6 +32,12 @@ def cutters():
 
 def boxes(model):
     return np.array([bounds(part) for part in model.parts])
+
+
+def sample(rng, solid, count):
+    """[N, 3] points in the solid."""
+    drawn = solid.center + (rng.uniform(-1, 1, (count, 3)) * solid.half) @ solid.rotation.T
+    return drawn[inside(solid, drawn)]
 
 
 def slides_on_the_edge(model):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from solid_points import inside, loose, sample
+from solid_points import inside, loose
 
 from caper_jax import categories
 from caper_jax.data.synthetic.bank import draw_models
@@ -39,7 +39,13 @@ def swung(model, points, state):
 
 
 def cloud(solids, rng, each):
-    return np.concatenate([sample(rng, solid, each) for solid in solids])
+    """[N, 3] points in the solids."""
+    points = []
+    for solid in solids:
+        unit = rng.uniform(-1, 1, (each, 3))
+        drawn = solid.center + (unit * solid.half) @ solid.rotation.T
+        points.append(drawn[inside(solid, drawn)])
+    return np.concatenate(points)
 
 
 def has_handles_behind(model):

@@ -101,8 +101,8 @@ def _base(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
             solids.append(box((0, foot / 2, middle), (share * half, foot / 2, reach)))
         else:
             for x in (-1, 1):
-                for end in (plan.back + 0.8 * half, plan.front - 0.8 * half):
-                    place = (x * half * 0.7, foot / 2, end)
+                for z in (plan.back + 0.8 * half, plan.front - 0.8 * half):
+                    place = (x * half * 0.7, foot / 2, z)
                     solids.append(cylinder(place, (half * 0.25, half * 0.25, foot / 2), _TURN_Y))
     thick = plan.plate - foot
     level = foot + thick / 2
@@ -112,12 +112,8 @@ def _base(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
     if name == "long":  # a bar that widens to a table under the head
         bar = max(half * rng.uniform(0.5, 0.9), plan.arm / 2 + 0.001)
         table = (plan.head + plan.back) / 2
-        solids.append(
-            box(
-                (0, level, (plan.back + table) / 2),
-                (bar, thick / 2, (table - plan.back) / 2 + 0.002),
-            )
-        )
+        reach = (table - plan.back) / 2 + 0.002
+        solids.append(box((0, level, (plan.back + table) / 2), (bar, thick / 2, reach)))
         body = (table, plan.front - nose)
     start, end = (0.0, level, body[0]), (0.0, level, body[1])
     if narrow < 1.0:
