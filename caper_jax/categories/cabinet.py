@@ -172,16 +172,15 @@ def carcass(rng: np.random.Generator, plan: Plan, open_top: bool, handle: Handle
             solids.append(box((0, y, -deep / 2), (inner, plan.divider / 2, deep / 2)))
     deep = (plan.depth - plan.back) / 2
     blind = rng.random() < 0.5
-    for edge, end, sign in (
-        (plan.levels[3], plan.top - plan.roof, 1),
-        (plan.levels[0], plan.base + plan.floor, -1),
+    for edge, end, thick, sign in (
+        (plan.levels[3], plan.top - plan.roof, plan.roof, 1),
+        (plan.levels[0], plan.base + plan.floor, plan.floor, -1),
     ):
         if abs(end - edge) < 1e-6:
             continue
-        thick = plan.roof
         solids.append(box((0, edge + sign * thick / 2, -deep), (inner, thick / 2, deep)))
         if blind:
-            hidden = 0.0 if plan.inset else plan.cover * plan.roof
+            hidden = 0.0 if plan.inset else plan.cover * thick
             y0, y1 = sorted((edge + sign * (hidden + plan.gap), end + sign * hidden))
             back, front = min(plan.face[0], 0.0), plan.face[1]
             half_x = plan.half_front + plan.gap

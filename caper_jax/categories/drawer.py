@@ -9,7 +9,7 @@ import numpy as np
 from caper_jax.articulation.category import Category, Joint, ObjectModel
 from caper_jax.categories import cabinet
 from caper_jax.categories.cabinet import Plan
-from caper_jax.categories.furniture import TURN_Y, Handle, StandStyle, stand
+from caper_jax.categories.furniture import TURN_Y, Handle, HandleStyle, StandStyle, stand
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid, frustum
 
 
@@ -51,10 +51,11 @@ _RELIEFS = ("plain", "bevel", "panel", "shaker", "bow", "grip", "notch")
 
 def _style(rng: np.random.Generator, kind: str, plan: Plan) -> _Style:
     relief = rng.choice(_RELIEFS, p=(0.4, 0.12, 0.1, 0.14, 0.07, 0.1, 0.07))
-    styles = ("none", "rod", "staple", "knob", "ball", "cup", "lip", "tag")
+    handle: HandleStyle
+    styles: tuple[HandleStyle, ...] = ("none", "rod", "staple", "knob", "ball", "cup", "lip", "tag")
     if relief in ("grip", "notch"):
         handle = "none"
-    elif relief in ("shaker", "bow"):
+    elif relief in ("shaker", "bow", "bevel"):
         handle = rng.choice(styles, p=(0.08, 0.36, 0.0, 0.2, 0.2, 0.16, 0.0, 0.0))
     else:
         handle = rng.choice(styles, p=(0.08, 0.22, 0.18, 0.14, 0.14, 0.07, 0.1, 0.07))
@@ -69,7 +70,8 @@ def _style(rng: np.random.Generator, kind: str, plan: Plan) -> _Style:
         rim=plan.scale * rng.uniform(0.02, 0.06),
         depth=depth,
         handle=Handle.draw(rng, handle, plan.scale, plan.width > 0.45),
-        handle_height=0.5 if rng.random() < 0.55 else rng.uniform(0.6, 0.82),
+        # A label needs the room above its rod.
+        handle_height=0.5 if handle == "tag" or rng.random() < 0.55 else rng.uniform(0.6, 0.82),
         grip=rng.uniform(0.08, 0.42),
         clearance=plan.scale * rng.uniform(0.002, 0.015),
         tray_height=rng.uniform(0.2, 0.4) if rails else rng.uniform(0.4, 0.93),
@@ -99,10 +101,11 @@ def _front(plan: Plan, style: _Style, index: int) -> list[Solid]:
         extents = (half_x - rim, height / 2 - rim, depth / 2)
         taper = 1 - np.minimum(1.5 * depth / np.array(extents[:2]), 0.5)
         extra = [frustum(place, extents, taper)]
-        at = face + depth
     elif style.relief == "bow":
         extra = [cylinder((0, center[1], face), (half_x, depth, height / 2), TURN_Y)]
-        at = face + 0.8 * depth
+        # The ends of a handle must still touch the curve.
+        reach = max(style.handle.share, 0.55)
+        at = face + 0.9 * depth * np.sqrt(1 - reach**2)
     elif style.relief == "grip":
         reach = min(0.3 * height, 0.035 * plan.scale)
         hole = box((0, high, face), (2 * style.grip * half_x, reach, depth))
@@ -115,9 +118,9 @@ def _front(plan: Plan, style: _Style, index: int) -> list[Solid]:
         solids = [frustum(center, half, taper)]
     else:
         solids = [box(center, half, hole=hole)]
-    y = low + style.handle_height * height
+    y = min(low + style.handle_height * height, high - min(style.handle.half, 0.4 * height))
     if style.handle.style == "lip":
-        y = high - min(style.handle.half, 0.1 * height)
+        y, at = high - min(style.handle.half, 0.1 * height), face - 0.4 * plan.front
     return solids + extra + style.handle.on((0, y, at), 2 * half_x, height)
 
 
@@ -183,9 +186,9 @@ DRAWER = Category(
     unit=1.78,
     mean_size=(
         (0.624, 0.773, 0.445),
-        (0.559, 0.234, 0.4),
-        (0.559, 0.201, 0.4),
-        (0.559, 0.178, 0.4),
+        (0.559, 0.234, 0.399),
+        (0.559, 0.2, 0.399),
+        (0.559, 0.178, 0.399),
     ),
     mean_center=(
         (0.0, 0.0, -0.01),

@@ -1,0 +1,103 @@
+"""Points in solids, by the definition of the unit solids: an oracle for what touches what."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caper_jax.geometry.solids import Solid
+
+
+def _depth(solid: Solid, points: np.ndarray) -> np.ndarray:
+    """[N] least distance, in metres, from points [N, 3] to the faces of a solid without its hole.
+
+    Negative outside; for slanted and curved faces a value of that order.
+    """
+    local = (points - solid.center) @ solid.rotation / solid.half
+    shrink = 1 + (np.array(solid.taper) - 1) * (local[:, 2:] + 1) / 2
+    across = np.abs(local[:, :2]) / np.maximum(shrink, 1e-9)
+    if solid.kind == "ellipsoid":
+        return (1 - np.linalg.norm(local, axis=1)) * solid.half.min()
+    if solid.kind in ("cylinder", "cone"):
+        side = (1 - np.linalg.norm(across, axis=1)) * solid.half[:2].min()
+    else:
+        side = ((1 - across) * solid.half[:2]).min(1)
+    return np.minimum(side, (1 - np.abs(local[:, 2])) * solid.half[2])
+
+
+def inside(solid: Solid, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    """[N] bool: points [N, 3] in the solid, at least ``margin`` metres below its surface."""
+    within = _depth(solid, points) > margin
+    if solid.hole is not None:
+        within &= _depth(solid.hole, points) < -margin
+    return within
+
+
+def deepest_overlap(
+    rng: np.random.Generator, moving: list[Solid], fixed: list[Solid], pose: np.ndarray
+) -> float:
+    """How deep, in metres, points of ``moving`` under ``pose`` [4, 4] lie in ``fixed``.
+
+    0 when none does. The points are sampled on surfaces, with all corners of boxes.
+    """
+    points = np.concatenate(
+        [_surface(rng, solid, 300) for solid in moving]
+        + [solid.corners() for solid in moving if solid.kind == "box"]
+    )
+    points = points[np.any([inside(solid, points, -1e-6) for solid in moving], axis=0)]
+    points = points @ pose[:3, :3].T + pose[:3, 3]
+    worst = 0.0
+    for solid in fixed:
+        depth = _depth(solid, points)
+        if solid.hole is not None:
+            depth = np.minimum(depth, -_depth(solid.hole, points))
+        worst = max(worst, float(depth.max()))
+    return worst
+
+
+def loose(solids: list[Solid], slack: float = 1e-3) -> list[int]:
+    """Indices of the solids that no chain of others, each within ``slack`` metres, holds to the
+    first.
+    """
+    rng = np.random.default_rng(0)
+    rest = dict(enumerate(solids))
+    reached = [rest.pop(0)]
+    while reached and rest:
+        touching = [
+            index
+            for index, solid in rest.items()
+            if any(_touch(rng, solid, other, slack) for other in reached)
+        ]
+        reached = [rest.pop(index) for index in touching]
+    return list(rest)
+
+
+def _touch(rng: np.random.Generator, one: Solid, other: Solid, slack: float) -> bool:
+    (low, high), (other_low, other_high) = one.extent(), other.extent()
+    low, high = np.maximum(low, other_low) - slack, np.minimum(high, other_high) + slack
+    if (low > high).any():
+        return False
+    points = np.concatenate([_surface(rng, one, 1500), _surface(rng, other, 1500)])
+    near = np.ones(len(points), bool)
+    for solid in (one, other):
+        near &= _depth(solid, points) > -slack
+        if solid.hole is not None:
+            near &= _depth(solid.hole, points) < slack
+    return bool(near.any())
+
+
+def _surface(rng: np.random.Generator, solid: Solid, count: int) -> np.ndarray:
+    """[N, 3] points on a solid without its hole, and on the hole."""
+    unit = rng.uniform(-1, 1, size=(count, 3))
+    across = np.abs(unit[:, :2])
+    if solid.kind == "ellipsoid":
+        gauge = np.linalg.norm(unit, axis=1)
+    else:
+        round_ = solid.kind in ("cylinder", "cone")
+        across = np.linalg.norm(across, axis=1) if round_ else across.max(1)
+        gauge = np.maximum(across, np.abs(unit[:, 2]))
+    unit /= gauge[:, None]
+    unit[:, :2] *= 1 + (np.array(solid.taper) - 1) * (unit[:, 2:] + 1) / 2
+    points = solid.center + (unit * solid.half) @ solid.rotation.T
+    if solid.hole is None:
+        return points
+    return np.concatenate([points, _surface(rng, solid.hole, count)])
