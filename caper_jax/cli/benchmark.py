@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from caper_jax.cli import common
+from caper_jax.cli import benchmark_loader, common
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ def build_parser() -> argparse.ArgumentParser:
         [
             ("generator", "frames/s of the generator, all categories"),
             ("generator --category box --json speed.json", "one category, kept in a file"),
+            ("loader --category box --data box.h5", "feeding from disk against memory"),
             ("generator --category box --set table=0.5", "with table pixels in half the masks"),
         ],
     )
@@ -167,5 +168,10 @@ BENCHMARKS = {
         "frames/s of the generator per category, with Kinect noise",
         _generator_arguments,
         _run_generator,
+    ),
+    "loader": Benchmark(
+        "what feeding from disk costs a training step of the fast preset",
+        benchmark_loader.add_arguments,
+        benchmark_loader.run,
     ),
 }
