@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from caper_jax.cli import common, generate_layout
+from caper_jax.cli import common, generate_layout, generate_urdf
 from caper_jax.errors import CaperError
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def build_parser() -> argparse.ArgumentParser:
             ("--category laptop --videos 30 --mode cam --out videos.h5", "moving camera"),
             ("--category box --frames 3 --images --out frames", "depth images to estimate from"),
             ("--category box --frames 50 --layout artimage --out root", "a root as of ArtImage"),
+            ("--category robotarm --urdf panda.urdf --out panda.h5", "an object of your own"),
         ],
     )
     parser.add_argument(
@@ -90,6 +91,7 @@ def build_parser() -> argparse.ArgumentParser:
         "intrinsics.json and truth.json, each of another instance",
     )
     generate_layout.add_arguments(parser)
+    generate_urdf.add_arguments(parser)
     parser.add_argument(
         "--out",
         required=True,
@@ -104,8 +106,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
     _check_options(arguments)
+    generate_urdf.check_options(arguments)
     arguments.frames = arguments.frames or FRAMES
-    if arguments.layout:
+    if arguments.urdf:
+        generate_urdf.write_urdf_frames(arguments)
+    elif arguments.layout:
         generate_layout.write_layout(arguments)
     elif arguments.images:
         _write_images(arguments)

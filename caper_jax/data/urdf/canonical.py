@@ -50,7 +50,7 @@ class ImportOptions:
       up: [3] the file's direction that becomes canonical y, or None.
       front: [3] the file's direction that becomes canonical z, or None.
       rest: states of the file's joints at rest, by the name of the joint or of the link it
-        carries; radians or metres. "" stands for all joints that the parts keep.
+        carries; degrees or metres. "" stands for all joints that the parts keep.
       parts: one link of each part in the category's order, or None.
       scale: factor for all lengths, or None for the category's mean size.
     """
@@ -104,14 +104,15 @@ def bring(model: UrdfModel, category: Category, options: ImportOptions) -> Impor
     if model.object_class and classes and model.object_class not in classes:
         raise CaperError(f"{model.path}: PartNet-Mobility calls it {model.object_class!r}")
     given = _rest_by_joint(model, options.rest)
-    tree = map_parts(model, category, options.parts, given)
+    held = given if "" not in options.rest else {}
+    tree = map_parts(model, category, options.parts, held)
     rule = rule_of(category.name)
     raw = reference(model, tree)
     if rule.root is not None and options.parts is None and rule.root(raw) == 1:
         raw = raw.exchanged()
         tree = replace(tree, links=tree.links[::-1])
     names = [part.joint.name for part in tree.joints]
-    found = np.array([given.get(name, given.get("", np.nan)) for name in names], np.float64)
+    found = np.array([given.get(name, np.nan) for name in names], np.float64)
     if np.isnan(found).any():
         found = np.where(np.isnan(found), rule.rest(raw), found)
     at_rest = raw.at(found)
@@ -151,14 +152,17 @@ def bring(model: UrdfModel, category: Category, options: ImportOptions) -> Impor
 
 
 def _rest_by_joint(model: UrdfModel, rest: Mapping[str, float]) -> dict[str, float]:
-    """Rest states by the joint's name; a link's name stands for the joint that carries it."""
-    carried = {joint.child: joint.name for joint in model.joints}
-    known = {joint.name: joint.name for joint in model.joints}
+    """Rest states in radians or metres by the joint's name, for the joints that are named."""
+    carried = {joint.child: joint for joint in model.joints}
+    known = carried | {joint.name: joint for joint in model.joints}
     found = {}
     for name, state in rest.items():
-        if name and name not in known and name not in carried:
+        if name and name not in known:
             raise CaperError(f"{model.path}: --rest: {unknown_name('joint', name, known)}")
-        found[known.get(name, carried.get(name, name))] = state
+        chosen = [known[name]] if name else model.joints
+        for joint in chosen:
+            turns = joint.kind == "revolute"
+            found[joint.name] = float(np.radians(state)) if turns else state
     return found
 
 

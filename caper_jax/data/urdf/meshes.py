@@ -94,10 +94,10 @@ def read_mesh(path: Path) -> Mesh:
     mesh = join([_plain(surface.vertices, surface.faces) for surface in surfaces])
     if not np.isfinite(mesh.vertices).all():
         raise CaperError(f"{path}: the mesh has coordinates that are not finite")
-    return mesh.scaled(_unit(scene.metadata.get("units")))
+    return mesh.scaled(_collada_unit(scene.units)) if path.suffix.lower() == ".dae" else mesh
 
 
-def _unit(text: Any) -> float:
+def _collada_unit(text: Any) -> float:
     """Metres per unit of a Collada file, which trimesh reports as e.g. "0.01 * meters"."""
     factor, found, _ = str(text or "").partition("* meters")
     return float(factor) if found else 1.0
