@@ -108,7 +108,9 @@ def build_bank(models: list[ObjectModel]) -> Bank:
             used[name] = used.get(name, 0) + 1
         for name, number in used.items():
             slots[name] = max(slots.get(name, 0), number)
-    groups = {name: _empty_group(name, count, slots[name]) for name in sorted(slots)}
+    # Never a single slot: XLA unrolls a loop of one turn into every use of its result, which costs
+    # more than ten further slots.
+    groups = {name: _empty_group(name, count, max(slots[name], 2)) for name in sorted(slots)}
     for index, rows in enumerate(solids):
         position = dict.fromkeys(slots, 0)
         for part, solid in rows:
