@@ -43,6 +43,32 @@ def test_everything_comes_back_to_a_hundredth_of_a_millimetre(tmp_path):
             np.testing.assert_array_equal(getattr(frame.truth, key), expected)
 
 
+def test_optional_fields_come_back_or_are_none(tmp_path):
+    path = tmp_path / "box.h5"
+    write_box(path)
+    plain = Hdf5Dataset(path)
+    assert plain.video is None and plain.frame is None and plain.instance is None
+    assert plain.videos == {} and plain[0].visibility is None
+    visibility = np.linspace(0, 1, 2 * FRAMES).reshape(FRAMES, 2)
+    video, frame = np.array([7, 2, 7, 2, 7]), np.array([3, 0, 1, 5, 2])
+    write_box(
+        path,
+        visibility=visibility,
+        video=video,
+        frame=frame,
+        instance=np.arange(FRAMES),
+        overwrite=True,
+    )
+    dataset = Hdf5Dataset(path)
+    np.testing.assert_array_equal(dataset.video, video)
+    np.testing.assert_array_equal(dataset.frame, frame)
+    np.testing.assert_array_equal(dataset.instance, np.arange(FRAMES))
+    assert dataset.videos == {"00002": [1, 3], "00007": [2, 4, 0]}  # in the order of time
+    for i in range(FRAMES):
+        validate(dataset[i], BOX)
+        np.testing.assert_array_equal(dataset[i].visibility, visibility[i].astype(np.float32))
+
+
 def test_a_file_appears_whole_or_not_at_all(tmp_path):
     path = tmp_path / "box.h5"
     with pytest.raises(TypeError):
@@ -72,6 +98,12 @@ def test_unwritable_places_are_named_first(tmp_path):
         ({"labels": np.full((FRAMES, POINTS), 2)}, r"labels must be -1 \(unknown\) to 1"),
         ({"labels": np.zeros((FRAMES, POINTS - 1))}, "labels is int8"),
         ({"visible": np.full((FRAMES, 2), -1)}, "visible must not be negative"),
+        ({"visibility": np.full((FRAMES, 2), 1.1)}, "visibility must be fractions"),
+        ({"visibility": np.ones((FRAMES, 3))}, r"visibility is float32 \(5, 3\)"),
+        ({"visibility": np.full((FRAMES, 2), np.nan)}, "visibility has NaN"),
+        ({"video": np.zeros(FRAMES)}, "video and frame must be given together"),
+        ({"video": [0] * FRAMES, "frame": [0, 1, 2, 3, 3]}, "name a frame twice"),
+        ({"video": [0] * FRAMES, "frame": [-1, 1, 2, 3, 4]}, "must not be negative"),
         ({"names": ["a"] * FRAMES}, "name has duplicates"),
         ({"names": ["a"]}, "name is"),
     ],
@@ -206,6 +238,8 @@ def test_validate_understands_poses(change, message):
         ({"labels": np.zeros(3, np.int32)}, r"labels has shape \(3,\)"),
         ({"labels": np.zeros(POINTS)}, "labels is float64, expected int32"),
         ({"visible": np.zeros(3, int)}, r"visible has shape \(3,\)"),
+        ({"visibility": np.ones(3)}, r"visibility has shape \(3,\)"),
+        ({"visibility": np.array([0.5, np.nan])}, "visibility must be fractions"),
     ],
 )
 def test_validate_understands_clouds(changes, message):
