@@ -126,7 +126,9 @@ def test_second_reading_twice_is_the_first(category, equivalence):
     np.testing.assert_array_equal(again, labels)
 
 
-@pytest.mark.parametrize(("name", "equivalence"), DECLARED)
+@pytest.mark.parametrize(
+    ("name", "equivalence"), [pair for pair in DECLARED if pair[0] in ("box", "laptop")]
+)
 def test_second_readings_of_clamshells_keep_their_conventions(name, equivalence):
     """Hinge along -x (so that positive opens) and behind the middle, in both readings."""
     category = categories.get(name)

@@ -33,6 +33,7 @@ from caper_jax.categories.cutter import CUTTER
 from caper_jax.categories.eyeglasses import EYEGLASSES
 from caper_jax.categories.laptop import LAPTOP
 from caper_jax.categories.robotarm import ROBOTARM
+from caper_jax.categories.scissors import SCISSORS
 from caper_jax.categories.stapler import STAPLER
 from caper_jax.errors import CaperError, unknown_name
 
@@ -97,5 +98,5 @@ def get(name: str) -> Category:
     return registered(name)
 
 
-for _category in (BOX, CUTTER, EYEGLASSES, LAPTOP, ROBOTARM, STAPLER):
+for _category in (BOX, CUTTER, EYEGLASSES, LAPTOP, ROBOTARM, SCISSORS, STAPLER):
     register(_category)

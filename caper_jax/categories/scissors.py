@@ -1,0 +1,231 @@
+"""scissors: two blades on a pivot along y; x to the tips, blades 20 deg apart at rest.
+
+The frame and the root follow from the object itself:
+
+* x halves the angle between the blades; a blade's line runs from the pivot to its tip.
+* The root is the blade whose handle reaches farther back (for more fingers, or with a finger
+  rest). Of equal halves either is: a half turn about x exchanges them (the declared equivalence).
+* y points to where the root's tip lies to the right (+z) of x. So the root's tip is at +z, its
+  handle (unless bent) at -z, and right-handed scissors have the root on top (+y).
+* A positive state turns the other blade about +y: its tip goes to -z, the scissors open. The
+  whole opening is 20 deg plus the state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from caper_jax.articulation.category import Category, Equivalence, Joint, ObjectModel, Viewpoint
+from caper_jax.categories.forms import about, mirrored, turned
+from caper_jax.categories.scissors_half import Half, blade_solids, handle_solids
+
+_Y = np.array([0.0, 1.0, 0.0])
+_HALF_TURN = np.diag([1.0, -1.0, -1.0])
+_REST = np.radians(20.0)
+_CLOSED, _WIDE = np.radians(3.0), np.radians(60.0)
+
+
+def _office(rng: np.random.Generator) -> tuple[Half, Half]:
+    """Household and office scissors, metal or with plastic handles, 120-230 mm."""
+    blade = rng.uniform(0.052, 0.105)
+    plastic = rng.random() < 0.75
+    tube = rng.uniform(0.0022, 0.0046), rng.uniform(0.003, 0.009)
+    if not plastic:
+        tube = rng.uniform(0.0016, 0.0028), rng.uniform(0.0015, 0.003)
+    width = rng.uniform(0.09, 0.17) * blade + 0.003
+    half = Half(
+        blade=blade,
+        width=width,
+        tip=rng.uniform(0.0012, 0.35 * width),
+        belly=rng.uniform(0.3, 0.7),
+        round_tip=rng.random() < 0.25,
+        metal=rng.uniform(0.001, 0.0026),
+        shank=blade * rng.uniform(0.22, 0.5),
+        loop=(rng.uniform(0.011, 0.021), rng.uniform(0.008, 0.0125)),
+        flat=rng.uniform(0.55, 1.0),
+        egg=rng.uniform(-0.15, 0.25),
+        tube=tube,
+        ring=rng.random() < 0.35,
+        splay=np.radians(rng.uniform(0, 25)),
+        gap=rng.uniform(0.0004, 0.002),
+        sheath=(rng.uniform(0.0035, 0.006), tube[1] * rng.uniform(0.8, 1.1)) if plastic else None,
+        screw=(rng.uniform(0.002, 0.0045), rng.uniform(0.0004, 0.0025)),
+    )
+    if rng.random() < 0.55:
+        return half, half
+    return _uneven(rng, half, half.loop[0] * rng.uniform(1.12, 1.9), rng.uniform(1.05, 1.25))
+
+
+def _kitchen(rng: np.random.Generator) -> tuple[Half, Half]:
+    """Broad and short-bladed, with big loops and often a bottle opener between the handles."""
+    half, _ = _office(rng)
+    tube = rng.uniform(0.0028, 0.005), rng.uniform(0.0045, 0.0075)
+    half = replace(
+        half,
+        blade=rng.uniform(0.075, 0.11),
+        width=rng.uniform(0.016, 0.027),
+        tip=rng.uniform(0.003, 0.008),
+        metal=rng.uniform(0.0018, 0.003),
+        shank=rng.uniform(0.03, 0.05),
+        loop=(rng.uniform(0.018, 0.03), rng.uniform(0.01, 0.015)),
+        tube=tube,
+        sheath=(rng.uniform(0.005, 0.009), tube[1] * rng.uniform(0.9, 1.1)),
+        screw=(rng.uniform(0.004, 0.0075), rng.uniform(0.001, 0.003)),
+        teeth=int(rng.integers(0, 3)),
+    )
+    if rng.random() < 0.45:
+        return half, half
+    return _uneven(rng, half, half.loop[0] * rng.uniform(1.15, 1.6), rng.uniform(1.0, 1.2))
+
+
+def _child(rng: np.random.Generator) -> tuple[Half, Half]:
+    """Short, blunt and round-tipped, with plastic loops that are large for the blades."""
+    half, _ = _office(rng)
+    tip = rng.uniform(0.005, 0.01)
+    tube = rng.uniform(0.0025, 0.004), rng.uniform(0.003, 0.006)
+    half = replace(
+        half,
+        blade=rng.uniform(0.045, 0.068),
+        width=max(rng.uniform(0.011, 0.017), 1.1 * tip),
+        tip=tip,
+        round_tip=True,
+        metal=rng.uniform(0.0012, 0.0035),
+        shank=rng.uniform(0.014, 0.028),
+        tube=tube,
+        sheath=(rng.uniform(0.0035, 0.006), tube[1] * rng.uniform(0.8, 1.1)),
+    )
+    if rng.random() < 0.75:
+        return half, half
+    return _uneven(rng, half, half.loop[0] * rng.uniform(1.3, 1.6), rng.uniform(1.0, 1.2))
+
+
+def _tailor(rng: np.random.Generator) -> tuple[Half, Half]:
+    """Long shears whose handles are bent upwards, for four fingers and for the thumb."""
+    half, _ = _office(rng)
+    tube = rng.uniform(0.003, 0.0048), rng.uniform(0.0045, 0.0075)
+    blade = rng.uniform(0.09, 0.145)
+    half = replace(
+        half,
+        blade=blade,
+        width=rng.uniform(0.016, 0.026),
+        tip=rng.uniform(0.0025, 0.007),
+        metal=rng.uniform(0.002, 0.0035),
+        shank=blade * rng.uniform(0.28, 0.45),
+        loop=(rng.uniform(0.013, 0.018), rng.uniform(0.011, 0.0145)),
+        tube=tube,
+        sheath=(rng.uniform(0.0055, 0.0085), tube[1] * rng.uniform(0.8, 1.1)),
+        screw=(rng.uniform(0.004, 0.007), rng.uniform(0.001, 0.004)),
+        bend=np.radians(rng.uniform(6, 24)),
+    )
+    root, other = _uneven(rng, half, rng.uniform(0.026, 0.04), rng.uniform(1.0, 1.3))
+    # The finger half is the broader one and has the blunter tip.
+    return replace(root, tip=root.tip * rng.uniform(1.0, 1.6)), other
+
+
+def _hair(rng: np.random.Generator) -> tuple[Half, Half]:
+    """Slim, all metal, with small round loops on long shanks; perhaps a finger rest."""
+    half, _ = _office(rng)
+    width = rng.uniform(0.006, 0.01)
+    radius = rng.uniform(0.0095, 0.0125)
+    half = replace(
+        half,
+        blade=rng.uniform(0.055, 0.095),
+        width=width,
+        tip=rng.uniform(0.001, 0.002),
+        belly=rng.uniform(0.1, 0.4),
+        round_tip=False,
+        metal=rng.uniform(0.0014, 0.0026),
+        shank=rng.uniform(0.035, 0.065),
+        loop=(radius, radius * rng.uniform(0.85, 1.0)),
+        flat=1.0,
+        egg=0.0,
+        tube=(rng.uniform(0.0016, 0.0026), rng.uniform(0.0016, 0.0028)),
+        sheath=None,
+        screw=(rng.uniform(0.002, 0.0035), rng.uniform(0.0004, 0.002)),
+    )
+    if rng.random() < 0.5:
+        return half, half
+    offset = half.shank * rng.uniform(0.0, 0.25)  # the thumb's shank may be shorter
+    return (
+        replace(half, rest=rng.uniform(0.009, 0.018)),
+        replace(half, shank=half.shank - offset),
+    )
+
+
+def _nail(rng: np.random.Generator) -> tuple[Half, Half]:
+    """Nail and embroidery scissors: all metal, 80-120 mm, short pointed blades."""
+    half, _ = _hair(rng)
+    half = replace(
+        half,
+        rest=0.0,
+        blade=rng.uniform(0.022, 0.045),
+        width=rng.uniform(0.005, 0.0085),
+        shank=rng.uniform(0.018, 0.036),
+        tip=rng.uniform(0.001, 0.0018),
+        tube=(rng.uniform(0.0014, 0.0022), rng.uniform(0.0014, 0.0024)),
+    )
+    return half, half
+
+
+def _uneven(rng: np.random.Generator, half: Half, length: float, wider: float) -> tuple[Half, Half]:
+    """The half with a loop for several fingers (``length`` its half length), and that half."""
+    large = replace(
+        half,
+        loop=(length, half.loop[1] * wider),
+        flat=half.flat * rng.uniform(0.8, 1.0),
+        ring=half.ring and rng.random() < 0.5,
+        splay=half.splay * rng.uniform(0.3, 1.0),
+    )
+    return large, half
+
+
+_KINDS = (_office, _kitchen, _child, _tailor, _hair, _nail)
+_SHARES = (0.48, 0.12, 0.12, 0.12, 0.1, 0.06)
+
+
+def shape(rng: np.random.Generator) -> ObjectModel:
+    """Draws one pair; half of them have equal halves, one in ten is left-handed."""
+    kind = _KINDS[rng.choice(len(_KINDS), p=_SHARES)]
+    root_half, other_half = kind(rng)
+    other_half = replace(other_half, bend=-other_half.bend)  # the same way, after the half turn
+    root = blade_solids(root_half) + handle_solids(root_half)
+    other = [
+        turned(solid, _HALF_TURN) for solid in blade_solids(other_half) + handle_solids(other_half)
+    ]
+    parts = [
+        [turned(solid, about("y", angle)) for solid in solids]
+        for solids, angle in ((root, -_REST / 2), (other, _REST / 2))
+    ]
+    if rng.random() < 0.1:
+        parts = [[mirrored(solid, "y") for solid in part] for part in parts]
+    widest = rng.uniform(np.radians(42), _WIDE)
+    return ObjectModel(
+        parts,
+        _Y[None],
+        np.zeros((1, 3)),
+        np.array([(_CLOSED - _REST, widest - _REST)]),
+    )
+
+
+SCISSORS = Category(
+    name="scissors",
+    parts=("root blade", "other blade"),
+    joints=(Joint("revolute", parent=0, limits=(_CLOSED - _REST, _WIDE - _REST)),),
+    directions=("x", "y"),
+    directions_reason="the way to the tips and the normal of the flat face show at any opening",
+    unit=10.6,
+    mean_size=((0.164, 0.01, 0.06), (0.151, 0.01, 0.063)),
+    mean_center=((0.0, 0.0, -0.016), (0.006, 0.0, 0.014)),
+    shape=shape,
+    # They lie on either face, and are held.
+    viewpoint=Viewpoint(elevation=(-80.0, 80.0), roll=180.0),
+    equivalences=(
+        Equivalence(
+            permutation=(1, 0),
+            turn=((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
+            reason="equal halves change places by a half turn about x",
+        ),
+    ),
+)
