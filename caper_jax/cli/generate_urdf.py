@@ -187,7 +187,7 @@ def _import_all(path: Path, category: Category, options: ImportOptions) -> list[
     from dataclasses import replace
 
     from caper_jax.data.urdf.canonical import import_urdf
-    from caper_jax.data.urdf.load import find_models
+    from caper_jax.data.urdf.folders import find_models
 
     files = find_models(path)
     objects, first = [], None

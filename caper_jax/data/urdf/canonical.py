@@ -14,24 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from caper_jax.articulation.category import Category
+from caper_jax.data.urdf.folders import PARTNET_CLASSES
 from caper_jax.data.urdf.load import UrdfModel, read_urdf
 from caper_jax.data.urdf.parts import PartTree, map_parts
 from caper_jax.data.urdf.reference import Reference, reference
 from caper_jax.data.urdf.rules import Rule, rule_of
 from caper_jax.errors import CaperError, unknown_name
 
-# PartNet-Mobility's classes that hold a category; others in a folder of models are passed over.
-PARTNET_CLASSES = {
-    "laptop": ("Laptop",),
-    "box": ("Box",),
-    "stapler": ("Stapler",),
-    "dishwasher": ("Dishwasher",),
-    "drawer": ("StorageFurniture", "Table"),
-    "cutter": ("Knife",),
-    "eyeglasses": ("Eyeglasses",),
-    "scissors": ("Scissors",),
-}
-_TRAVEL = 0.9  # share of a slide's range that is used, see reference conventions of the generator
+_TRAVEL = 0.9  # share of a slide's way that is used, as by generated shapes
 _ROTATIONS = np.array(
     [
         matrix

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from caper_jax.data.images import read_json
+from caper_jax.data.urdf.folders import PARTNET_URDF, partnet_class, partnet_labels
 from caper_jax.data.urdf.meshes import Mesh, join, read_mesh, shape_mesh
 from caper_jax.errors import CaperError
 
@@ -24,7 +24,6 @@ KINDS: dict[str, Kind] = {
     "continuous": "revolute",
     "prismatic": "prismatic",
 }
-PARTNET_URDF = "mobility.urdf"
 
 
 @dataclass(frozen=True)
@@ -33,13 +32,14 @@ class UrdfJoint:
 
     Attributes:
       name: as in the file.
-      kind: "revolute" (also for continuous joints), "prismatic", or "fixed" for all that has no
-        state of its own: fixed, floating, planar and mimicking joints, and empty ranges.
+      kind: "revolute" (also for continuous joints), "prismatic", or "fixed" (also for floating
+        and planar joints, and empty ranges).
       parent, child: names of links.
       origin: [4, 4] joint frame -> parent link's frame at state 0.
       axis: [3] unit vector, joint frame.
       limits: (low, high) radians or metres; infinite where the file gives none.
-      remark: why a joint that moves in the file counts as fixed, or "".
+      remark: why a joint that moves in the file has no state of its own, or "".
+      mimic: (name of the joint it follows, multiplier, offset), or None.
     """
 
     name: str
@@ -50,6 +50,12 @@ class UrdfJoint:
     axis: np.ndarray
     limits: tuple[float, float]
     remark: str = ""
+    mimic: tuple[str, float, float] | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether it has a state of its own."""
+        return self.kind != "fixed" and self.mimic is None
 
 
 @dataclass(frozen=True)
@@ -84,9 +90,11 @@ class UrdfModel:
         while open_links:
             link = open_links.pop()
             for joint in outgoing.get(link, ()):
-                motion = joint_motion(
-                    joint.kind, joint.axis, np.zeros(3), states.get(joint.name, 0)
-                )
+                state = states.get(joint.name, 0.0)
+                if joint.mimic is not None:
+                    followed, multiplier, offset = joint.mimic
+                    state = multiplier * states.get(followed, 0.0) + offset
+                motion = joint_motion(joint.kind, joint.axis, np.zeros(3), state)
                 poses[joint.child] = poses[link] @ joint.origin @ motion
                 open_links.append(joint.child)
         return poses
@@ -103,42 +111,6 @@ def joint_motion(kind: str, axis: np.ndarray, pivot: np.ndarray, state: float) -
         motion[:3, :3] += np.sin(state) * hat + 2 * np.sin(state / 2) ** 2 * hat @ hat
         motion[:3, 3] = pivot - motion[:3, :3] @ pivot
     return motion
-
-
-def find_models(path: str | Path) -> list[Path]:
-    """The URDF files meant by a path, sorted.
-
-    Args:
-      path: a URDF file, a folder with one (PartNet-Mobility's mobility.urdf goes before others),
-        or a folder of such folders.
-
-    Raises:
-      CaperError: nothing there, no URDF, or several in one folder.
-    """
-    path = Path(path)
-    if path.is_file():
-        return [path]
-    if not path.is_dir():
-        raise CaperError(f"--urdf {path}: no such file or folder")
-    own = _urdf_of(path)
-    if own is not None:
-        return [own]
-    found = [_urdf_of(folder) for folder in sorted(path.iterdir()) if folder.is_dir()]
-    models = [urdf for urdf in found if urdf is not None]
-    if not models:
-        raise CaperError(f"--urdf {path}: holds no .urdf file, and no folder in it does")
-    return models
-
-
-def _urdf_of(folder: Path) -> Path | None:
-    """The one URDF of a folder, None when it has none."""
-    if (folder / PARTNET_URDF).is_file():
-        return folder / PARTNET_URDF
-    files = sorted(folder.glob("*.urdf"))
-    if len(files) > 1:
-        names = ", ".join(file.name for file in files[:6])
-        raise CaperError(f"{folder}: holds {len(files)} URDF files ({names}); name one of them")
-    return files[0] if files else None
 
 
 def read_urdf(path: str | Path) -> UrdfModel:
@@ -169,8 +141,8 @@ def read_urdf(path: str | Path) -> UrdfModel:
         links=links,
         joints=joints,
         root=root,
-        labels=_partnet_labels(path.parent) if partnet else {},
-        object_class=_partnet_class(path.parent) if partnet else "",
+        labels=partnet_labels(path.parent) if partnet else {},
+        object_class=partnet_class(path.parent) if partnet else "",
     )
 
 
@@ -218,11 +190,20 @@ def _joint(path: Path, joint: Any) -> UrdfJoint:
             raise CaperError(f"{where}: its limits {limits} are no range")
         if limits[1] - limits[0] < 1e-6:
             kind, remark = "fixed", "empty range"
+    mimic = None
     if kind != "fixed" and joint.mimic is not None:
-        kind, remark = "fixed", f"mimics {joint.mimic.joint}"
+        remark = f"mimics {joint.mimic.joint}"
+        multiplier, offset = joint.mimic.multiplier, joint.mimic.offset
+        mimic = (
+            joint.mimic.joint,
+            1.0 if multiplier is None else float(multiplier),
+            0.0 if offset is None else float(offset),
+        )
     if not (np.isfinite(origin).all() and origin.shape == (4, 4)):
         raise CaperError(f"{where}: its origin has numbers that are not finite")
-    return UrdfJoint(joint.name, kind, joint.parent, joint.child, origin, axis, limits, remark)
+    return UrdfJoint(
+        joint.name, kind, joint.parent, joint.child, origin, axis, limits, remark, mimic
+    )
 
 
 def _root(path: Path, names: list[str], joints: tuple[UrdfJoint, ...]) -> str:
@@ -293,27 +274,3 @@ def _resolve(urdf: Path, filename: str | None, where: str) -> Path:
             return candidate
     looked = "the folders above it and in ROS_PACKAGE_PATH" if found else str(above[0])
     raise CaperError(f"{where}: mesh {filename!r} is not there (looked in {looked})")
-
-
-def _partnet_labels(folder: Path) -> dict[str, str]:
-    """What PartNet-Mobility calls its links, from semantics.txt or else mobility_v2.json."""
-    semantics, mobility = folder / "semantics.txt", folder / "mobility_v2.json"
-    if semantics.is_file():
-        rows = [line.split() for line in semantics.read_text(encoding="utf-8").splitlines()]
-        return {row[0]: row[2] for row in rows if len(row) >= 3}
-    if not mobility.is_file():
-        return {}
-    content = read_json(mobility)
-    nodes = content if isinstance(content, list) else []
-    return {
-        f"link_{node['id']}": str(node["name"])
-        for node in nodes
-        if isinstance(node, dict) and "id" in node and "name" in node
-    }
-
-
-def _partnet_class(folder: Path) -> str:
-    """The object's class in meta.json, "" where it says none."""
-    path = folder / "meta.json"
-    content = read_json(path) if path.is_file() else {}
-    return str(content.get("model_cat", "")) if isinstance(content, dict) else ""

@@ -137,39 +137,34 @@ def _unfolded(ref: Reference) -> np.ndarray:
     return np.array(states)
 
 
-def _blade_end(ref: Reference, part: int) -> np.ndarray:
-    """scissors: angles (low, high) under which the end of a blade shows from the pivot.
+def _tip(ref: Reference, part: int) -> np.ndarray:
+    """scissors: unit vector from the pivot to the tip of a blade, the part's narrower end.
 
-    The blade is the narrower end of the part. Counted about the pivot's axis from the first
-    direction across it.
+    A tip that is round or cut off counts by its middle.
     """
     plane = ref.across(0)
     flat = (ref.parts[part].vertices - ref.pivot[0]) @ plane.T
     along = plane @ ref.direction(part, 0)
-    ahead, aside = flat @ along, flat @ np.array([-along[1], along[0]])
+    side = np.array([-along[1], along[0]])
+    ahead, aside = flat @ along, flat @ side
     spread = {
         sign: np.ptp(aside[sign * ahead > 0.25 * (sign * ahead).max()]) for sign in (1.0, -1.0)
     }
-    sign = min(spread, key=lambda side: spread[side])
+    sign = min(spread, key=lambda end: spread[end])
     reach = np.hypot(ahead, aside) * (sign * ahead > 0)
     end = reach > 0.97 * reach.max()
-    angles = np.arctan2(sign * aside[end], sign * ahead[end])
-    return np.arctan2(sign * along[1], sign * along[0]) + np.array([angles.min(), angles.max()])
+    angles = np.arctan2(aside[end], sign * ahead[end])
+    angle = (angles.min() + angles.max()) / 2
+    return (np.cos(angle) * sign * along + np.sin(angle) * side) @ plane
 
 
 def _tips(ref: Reference) -> tuple[np.ndarray, np.ndarray, float]:
-    """scissors: unit vectors from the pivot to the tips, and the sense in which they open.
-
-    A tip is where the cutting edge ends: the side of a blade's end that faces the other blade.
-    """
-    plane = ref.across(0)
-    ends = _blade_end(ref, 0), _blade_end(ref, 1)
-    apart = (ends[1].mean() - ends[0].mean() + np.pi) % (2 * np.pi) - np.pi
+    """scissors: the two tips, and the sense in which the other blade opens."""
+    root, other = _tip(ref, 0), _tip(ref, 1)
+    apart = ref.turn(0, root, other)
     low, high = ref.limits[0]
     middle = apart + (low + high) / 2 if np.isfinite(high - low) else apart
     sense = float(np.sign(middle if abs(middle) > np.radians(2) else apart)) or 1.0
-    angles = (ends[0][1], ends[1][0]) if sense > 0 else (ends[0][0], ends[1][1])
-    root, other = (np.array([np.cos(a), np.sin(a)]) @ plane for a in angles)
     return root, other, sense
 
 
