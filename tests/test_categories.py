@@ -127,7 +127,7 @@ def test_joints_are_unit_axes_near_the_object_with_limits_of_the_category(drawn)
         np.testing.assert_allclose(np.linalg.norm(model.axis, axis=-1), 1.0, atol=1e-12)
         assert (np.abs(model.pivot) <= 1.2 * np.abs(box).max((0, 1))).all()
         low, high = model.limits.T
-        assert (low < high).all() and (low <= 0).all() and (high > 0).all()
+        assert (low < high).all() and (low <= 0).all() and (high >= 0).all()
         assert (low >= widest[:, 0] - 1e-9).all() and (high <= widest[:, 1] + 1e-9).all()
 
 

@@ -30,6 +30,8 @@ from caper_jax.articulation.category import Category
 from caper_jax.categories import user_module
 from caper_jax.categories.box import BOX
 from caper_jax.categories.cutter import CUTTER
+from caper_jax.categories.dishwasher import DISHWASHER
+from caper_jax.categories.drawer import DRAWER
 from caper_jax.categories.eyeglasses import EYEGLASSES
 from caper_jax.categories.laptop import LAPTOP
 from caper_jax.categories.robotarm import ROBOTARM
@@ -98,5 +100,5 @@ def get(name: str) -> Category:
     return registered(name)
 
 
-for _category in (BOX, CUTTER, EYEGLASSES, LAPTOP, ROBOTARM, SCISSORS, STAPLER):
+for _category in (BOX, CUTTER, DISHWASHER, DRAWER, EYEGLASSES, LAPTOP, ROBOTARM, SCISSORS, STAPLER):
     register(_category)

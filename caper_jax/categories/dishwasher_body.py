@@ -1,0 +1,191 @@
+"""Dishwashers without their door: measures and body.
+
+Measured with the door shut: floor at y = 0, opening at z = 0, x centred.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from caper_jax.categories.furniture import TURN_X, stand
+from caper_jax.geometry.solids import Solid, box, cylinder
+
+# Probability, and ranges of width, height (without worktop) and depth in metres.
+TYPES = {
+    "standard": (0.4, (0.56, 0.64), (0.78, 0.9), (0.5, 0.66)),
+    "slim": (0.2, (0.42, 0.48), (0.78, 0.88), (0.48, 0.64)),
+    "built_in": (0.25, (0.44, 0.62), (0.7, 0.9), (0.48, 0.62)),
+    "table_top": (0.15, (0.4, 0.6), (0.38, 0.5), (0.4, 0.55)),
+}
+_GAP = 0.004  # between the door and what is around it, metres
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Measures in metres, door shut; x centred.
+
+    Attributes:
+      width, height, depth: outer extents; the height counts from the floor.
+      base: lower edge of the tub; below it only the plinth.
+      side, floor, back: thickness of the tub's walls.
+      ceiling: y of the upper edge of the opening.
+      thick: of the door's plate.
+      half_door: half its width.
+      low, high: y of its lower and upper edge.
+      hinge: (y, z).
+      recess: how far the plinth must stand back to let the door's lower edge pass.
+      plug: depth of the door's inner panel, which lies in the opening; 0 for none.
+    """
+
+    width: float
+    height: float
+    depth: float
+    base: float
+    side: float
+    floor: float
+    back: float
+    ceiling: float
+    thick: float
+    half_door: float
+    low: float
+    high: float
+    hinge: tuple[float, float]
+    recess: float
+    plug: float
+
+    @property
+    def cavity(self) -> tuple[np.ndarray, np.ndarray]:
+        """Low and high corner [3] of the tub's inside."""
+        half_x = self.width / 2 - self.side
+        low = np.array([-half_x, self.base + self.floor, -self.depth + self.back])
+        return low, np.array([half_x, self.ceiling, 0.0])
+
+
+def draw_plan(rng: np.random.Generator, kind: str, fascia: bool) -> Plan:
+    _, *ranges = TYPES[kind]
+    width, height, depth = (rng.uniform(*bounds) for bounds in ranges)
+    small = kind == "table_top"
+    thick = rng.uniform(0.016, {"built_in": 0.03, "table_top": 0.04}.get(kind, 0.06))
+    base = rng.uniform(0.012, 0.05) if small else rng.uniform(0.05, 0.17)
+    floor = rng.uniform(0.01, 0.06)
+    if small or rng.random() < 0.65:
+        # The door turns about its own lower edge and stays in front of the body.
+        low = max(base + floor * rng.uniform(-0.3, 0.8), 1.5 * thick + 0.024)
+        base = max(base, low - 0.8 * floor)
+        hinge = (low, 0.002 + thick * rng.uniform(0.0, 0.8))
+        recess = 0.002
+    else:
+        # The hinge lies behind the door, whose lower edge swings back over the plinth.
+        behind, below = rng.uniform(0.005, 0.04), rng.uniform(0.02, min(0.09, 0.6 * base))
+        hinge = (max(base - 0.003, 1.5 * thick + behind + 0.02), -behind)
+        base = hinge[0] + 0.003
+        low = hinge[0] - below
+        recess = behind + below + 0.006
+    roof = rng.uniform(0.09, 0.16) * height if fascia else rng.uniform(0.012, 0.05)
+    ceiling = height - roof
+    side = rng.uniform(0.008, 0.05) * width / 0.6
+    return Plan(
+        width=width,
+        height=height,
+        depth=depth,
+        base=base,
+        side=side,
+        floor=floor,
+        back=rng.uniform(0.01, 0.09),
+        ceiling=ceiling,
+        thick=thick,
+        half_door=width / 2 + rng.uniform(-min(0.5 * side, 0.008), 0.002),
+        low=low,
+        high=ceiling + (0.008 if fascia else rng.uniform(0.5, 1.0) * roof - _GAP),
+        hinge=hinge,
+        recess=recess,
+        plug=0.0 if rng.random() < 0.12 else rng.uniform(0.006, 0.03),
+    )
+
+
+def body(rng: np.random.Generator, plan: Plan, kind: str, fascia: bool) -> list[Solid]:
+    low, high = plan.cavity
+    half = np.array([plan.width, plan.height - plan.base, plan.depth]) / 2
+    center = np.array([0.0, plan.base + half[1], -half[2]])
+    high = high + (0, 0, 0.1)
+    housing = kind == "built_in" and not fascia and rng.random() < 0.2
+    if housing:  # open above, as a kitchen unit before the worktop lies on it
+        high[1] = plan.height + 0.1
+    solids = [box(center, half, hole=box((low + high) / 2, (high - low) / 2))]
+    if housing:
+        thick, deep = plan.height - plan.ceiling, rng.uniform(0.03, 0.1)
+        for z in (-deep / 2, -plan.depth + plan.back + deep / 2):
+            solids.append(box((0, plan.ceiling + thick / 2, z), (high[0], thick / 2, deep / 2)))
+    solids += _base(rng, plan, kind)
+    if fascia:
+        solids += _fascia(rng, plan)
+    if not housing and rng.random() < {"built_in": 0.2, "table_top": 0.3}.get(kind, 0.6):
+        solids += _worktop(rng, plan, panels=kind == "built_in")
+    if rng.random() < 0.15:  # connections at the back
+        extents = np.array([rng.uniform(0.1, 0.4) * plan.width, rng.uniform(0.03, 0.1), 0.015])
+        solids.append(box((0, plan.base + extents[1] + 0.02, -plan.depth - 0.014), extents))
+    return solids
+
+
+def _base(rng: np.random.Generator, plan: Plan, kind: str) -> list[Solid]:
+    """Plinth or feet from the floor to the tub."""
+    if kind == "table_top" or rng.random() < 0.25:
+        style = rng.choice(("round", "square"))
+        room = plan.depth - 1.5 * plan.recess
+        feet = stand(rng, style, (plan.width, plan.base, room))
+        return [foot.moved(np.array([0.0, 0.0, room - plan.depth])) for foot in feet]
+    front = -plan.recess - rng.uniform(0.0, 0.06) * (rng.random() < 0.7)
+    back = -plan.depth + rng.uniform(0.0, 0.1)
+    half = np.array(
+        [plan.width * rng.uniform(0.46, 0.5), plan.base / 2, (front - back) / 2],
+    )
+    return [box((0, plan.base / 2, (front + back) / 2), half)]
+
+
+def _fascia(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+    """The control strip above the door, part of the body."""
+    low, high = plan.high + _GAP, plan.height
+    out = plan.thick * rng.uniform(0.6, 1.15) + 0.002
+    middle, half = (low + high) / 2, np.array([plan.half_door, (high - low) / 2, out / 2])
+    solids = [box((0, middle, out / 2), half)]
+    return solids + controls(rng, middle, out, half[0], half[1])
+
+
+def controls(
+    rng: np.random.Generator, y: float, z: float, half_x: float, half_y: float
+) -> list[Solid]:
+    """Buttons, a dial or a display on a strip that faces +z."""
+    solids: list[Solid] = []
+    radius = min(0.4 * half_y, 0.007)
+    start, step = rng.uniform(0.2, 0.5) * half_x, rng.uniform(2.6, 4.0) * radius
+    for index in range(rng.integers(0, 4)):
+        solids.append(cylinder((start + index * step, y, z), (radius, radius, 0.003)))
+    if rng.random() < 0.35:
+        dial = min(0.6 * half_y, rng.uniform(0.012, 0.022))
+        solids.append(cylinder((-0.7 * half_x, y, z + 0.005), (dial, dial, 0.009)))
+    if rng.random() < 0.4:
+        place = (rng.uniform(-0.3, 0.0) * half_x, y, z)
+        solids.append(box(place, (0.15 * half_x, 0.5 * half_y, 0.002)))
+    return solids
+
+
+def _worktop(rng: np.random.Generator, plan: Plan, panels: bool) -> list[Solid]:
+    """A plate on top, in a kitchen with cabinet sides under it."""
+    thick = rng.uniform(0.015, 0.045)
+    front = plan.thick * rng.uniform(0.0, 1.4)
+    back = -plan.depth - rng.uniform(0.0, 0.03)
+    half_x = plan.width / 2 + rng.uniform(0.0, 0.01)
+    sides: list[Solid] = []
+    if panels and rng.random() < 0.6:
+        board = rng.uniform(0.008, 0.012)
+        half_x = plan.width / 2 + 2 * board + 0.001
+        half = np.array([board, plan.height / 2, plan.depth / 2])
+        for side in (-1, 1):
+            sides.append(box((side * (half_x - board), half[1], -half[2]), half))
+    y = plan.height + thick / 2
+    plate = box((0, y, (front + back) / 2), (half_x, thick / 2, (front - back) / 2))
+    if rng.random() < 0.3:
+        sides.append(cylinder((0, y, front), (thick / 2, thick / 2, half_x), TURN_X))
+    return [plate, *sides]
