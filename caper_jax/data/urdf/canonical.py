@@ -22,6 +22,7 @@ from caper_jax.data.urdf.rules import Rule, rule_of
 from caper_jax.errors import CaperError, unknown_name
 
 _TRAVEL = 0.9  # share of a slide's way that is used, as by generated shapes
+_STRAIGHT = np.radians(15)
 _ROTATIONS = np.array(
     [
         matrix
@@ -174,7 +175,9 @@ def _axes(
     nearest = _ROTATIONS[np.argmax(traces)]
     angle = float(np.degrees(np.arccos(np.clip((traces.max() - 1) / 2, -1, 1))))
     along = all(np.abs(d).max() > 1 - 1e-9 for d in (d / np.linalg.norm(d) for d in given))
-    snapped = along and angle <= rule.snap
+    # A first joint that is oblique to those axes says that the object is.
+    straight = np.abs(at_rest.axis[0]).max() > np.cos(_STRAIGHT)
+    snapped = along and straight and angle <= rule.snap
     rotation = nearest if snapped else rotation
     source = " and ".join(
         f"{name} {'given' if option is not None else 'detected'}"

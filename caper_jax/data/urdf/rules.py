@@ -286,5 +286,5 @@ _RULES = {
     "cutter": Rule(_closed, _cutter_frame, _always(_X)),
     "eyeglasses": Rule(_unfolded, _glasses_frame, _temple_axes, order=0, snap=20.0),
     "scissors": Rule(_apart, _scissors_frame, _blade_axes, snap=6.0, root=_longer_handle),
-    "robotarm": Rule(_zero, _arm_frame, _positive_axes),
+    "robotarm": Rule(_zero, _arm_frame, _positive_axes, snap=50.0),
 }
