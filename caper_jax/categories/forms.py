@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -88,16 +87,13 @@ def chain(points, half, up, closed: bool = False, round_: bool = False) -> list[
     Each reaches a little beyond its corners, so that no gap shows on the outside of a bend.
 
     Args:
-      half: section of all, or a function of the number of the segment.
-      up, round_: as for ``beam``.
+      half, up, round_: as for ``beam``.
     """
     points = np.asarray(points, np.float64)
-    section: Callable = half if callable(half) else lambda _: half
     ends = np.roll(points, -1, axis=0) if closed else points[1:]
     solids = []
-    for index, (start, end) in enumerate(zip(points[: len(ends)], ends, strict=True)):
-        size = section(index)
+    for start, end in zip(points[: len(ends)], ends, strict=True):
         way = end - start
-        reach = 0.35 * size[0] / math.sqrt(way @ way)
-        solids.append(beam(start - reach * way, end + reach * way, size, up, None, round_))
+        reach = 0.35 * half[0] / math.sqrt(way @ way) * way
+        solids.append(beam(start - reach, end + reach, half, up, None, round_))
     return solids
