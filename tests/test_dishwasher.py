@@ -167,6 +167,7 @@ def test_every_kind_of_dishwasher_occurs(models):
     assert share(lambda m: reach(m) > 0.015) > 0.3  # a plug
     assert 0.1 < share(strip) < 0.45
     assert share(lambda m: m.parts[0][0].hole.extent()[1][1] > m.parts[0][0].extent()[1][1]) > 0.01
+    assert share(lambda m: m.parts[0][0].hole.extent()[0][2] < bounds(m.parts[0])[0][2]) > 0.01
     crockery = share(
         lambda m: any(s.kind in ("cylinder", "ellipsoid") and s.half[2] < 0.008 for s in m.parts[0])
     )

@@ -81,17 +81,19 @@ def test_trays_are_open_above_and_leave_a_cavity(models):
         for part, limits in zip(model.parts[1:], model.limits, strict=True):
             tray = next(solid for solid in part[1:] if _is_tray(solid))
             room = tray.hole
-            # Just above the tray's floor, and just over its rim.
+            # Just above the tray's floor, and just over its rim, in a corner.
             floor = room.center[1] - room.half[1]
             rim = tray.center[1] + tray.half[1]
-            above = [(room.center[0], y, room.center[2]) for y in (floor + 1e-4, rim + 1e-4)]
-            points = np.array(above) + np.array([0.8, 0, 0.8]) * room.half
-            assert not any(inside(tray, points).any() for tray in [tray])
+            points = np.tile(room.center + np.array([0.8, 0, -0.8]) * room.half, (2, 1))
+            points[:, 1] = floor + 1e-4, rim + 1e-4
+            assert not inside(tray, points).any()
             assert not any(inside(solid, points).any() for solid in body)
-            # The tray itself does not reach into the room that it leaves when open.
-            left = tray.center + (0, 0, -0.9 * tray.half[2])
-            gone = left[None] - slid(limits[1])[:3, 3]
-            assert not inside(tray, gone).any()
+            # Once the drawer is open, nothing is left where the back of its tray was.
+            back = tray.center - np.array([0, 0, tray.half[2] - 1e-4])
+            gone = back[None] - slid(limits[1])[:3, 3]
+            assert inside(tray, back[None]).all()
+            assert not any(inside(solid, gone).any() for solid in part)
+            assert not any(inside(solid, back[None]).any() for solid in body)
 
 
 def _is_tray(solid) -> bool:

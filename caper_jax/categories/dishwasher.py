@@ -159,7 +159,7 @@ DISHWASHER = Category(
     directions=("y", "z"),
     directions_reason="nearly mirror-symmetric in the y-z plane, so y and z are what shows",
     unit=1.31,
-    mean_size=((0.543, 0.776, 0.581), (0.532, 0.073, 0.633)),
+    mean_size=((0.543, 0.776, 0.58), (0.532, 0.072, 0.633)),
     mean_center=((0.0, 0.0, -0.302), (0.0, -0.291, 0.276)),
     shape=shape,
 )

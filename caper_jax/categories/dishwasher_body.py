@@ -113,6 +113,9 @@ def body(rng: np.random.Generator, plan: Plan, kind: str, fascia: bool) -> list[
     housing = kind == "built_in" and not fascia and rng.random() < 0.2
     if housing:  # open above, as a kitchen unit before the worktop lies on it
         high[1] = plan.height + 0.1
+    backless = rng.random() < 0.05
+    if backless:
+        low = low - (0, 0, 0.1)
     solids = [box(center, half, hole=box((low + high) / 2, (high - low) / 2))]
     if housing:
         thick, deep = plan.height - plan.ceiling, rng.uniform(0.03, 0.1)
@@ -123,7 +126,7 @@ def body(rng: np.random.Generator, plan: Plan, kind: str, fascia: bool) -> list[
         solids += _fascia(rng, plan)
     if not housing and rng.random() < {"built_in": 0.2, "table_top": 0.3}.get(kind, 0.6):
         solids += _worktop(rng, plan, panels=kind == "built_in")
-    if rng.random() < 0.15:  # connections at the back
+    if not backless and rng.random() < 0.15:  # connections at the back
         extents = np.array([rng.uniform(0.1, 0.4) * plan.width, rng.uniform(0.03, 0.1), 0.015])
         solids.append(box((0, plan.base + extents[1] + 0.02, -plan.depth - 0.014), extents))
     return solids
