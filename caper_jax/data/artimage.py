@@ -59,6 +59,7 @@ class ArtImageDataset:
 
     format = FORMAT
     mask_source = "annotated part masks"
+    _annotations = "train/annotations/*.json"  # in the category's folder
 
     def __init__(
         self,
@@ -100,6 +101,16 @@ class ArtImageDataset:
             raise CaperError(f"{self._home}: split {self.split!r} holds no frame")
         self.names: Sequence[str] = list(self._files)
 
+    @classmethod
+    def categories_in(cls, root: Path) -> list[str]:
+        """Registered categories that a root holds."""
+        return [name for name in categories.names() if any((root / name).glob(cls._annotations))]
+
+    @staticmethod
+    def splits_in(root: Path, category: str) -> list[str]:
+        """Splits that a root lists frames of, for one category."""
+        return sorted(path.stem for path in (root / category).glob("*.txt"))
+
     def __len__(self) -> int:
         return len(self.names)
 
@@ -110,7 +121,8 @@ class ArtImageDataset:
         instance = annotation["instances"][0]
         keys = ("transformation",)
         links = ordered_links(instance, self.category.num_parts, str(path), first=0, keys=keys)
-        model = self._model(str(instance["urdf_id"]))
+        urdf_id = str(instance["urdf_id"])
+        model = self._model(urdf_id)
         links = [links[link] for link in model.links]
         truth = pose_of_links(model, links, self.category, str(path), scaled=False)
         self._check_states(links, model, truth.joint_state, path)
@@ -130,7 +142,7 @@ class ArtImageDataset:
         part_of_label[list(model.links)] = np.arange(self.category.num_parts)
         parts = part_of_label[np.maximum(labels, 0)]
         intrinsics = self._intrinsics(self._camera, depth.shape)
-        return labelled_frame(name, depth, parts, intrinsics, truth, self._num_points)
+        return labelled_frame(name, depth, parts, intrinsics, truth, self._num_points, urdf_id)
 
     def _find_home(self) -> Path:
         """The category's folder."""
@@ -150,8 +162,7 @@ class ArtImageDataset:
         return read_model(self._home / "urdf", urdf_id, self.category)
 
     def _list_frames(self) -> dict[str, Path]:
-        folder = self._home / "train" / "annotations"
-        return {path.stem: path for path in sorted(folder.glob("*.json"))}
+        return {path.stem: path for path in sorted(self._home.glob(self._annotations))}
 
     def _read_list(self) -> list[str]:
         """Lines of the split's text file."""

@@ -18,6 +18,7 @@ origin of a joint on another part counts from that part's own joint, as in any U
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,10 +93,17 @@ def read_model(folder: Path, urdf_id: int | str, category: Category) -> RestMode
 
     rest = Rest(moved, np.array(axis), np.array(pivot), np.array(opening))
     reading = canonical_reading(rest, category, str(home))
-    return _canonical(rest, poses, reading)
+    return rest_model(rest, poses, reading)
 
 
-def _canonical(rest: Rest, poses: list[np.ndarray], reading: Reading) -> RestModel:
+def rest_model(rest: Rest, poses: Sequence[np.ndarray], reading: Reading) -> RestModel:
+    """The model of an object whose reading is known.
+
+    Args:
+      rest: the object at rest, in the file's frame.
+      poses: K [4, 4], the links' own frames -> that frame, at rest.
+      reading: how it becomes ours.
+    """
     turn, order = reading.turn, list(reading.order)
     joints = np.array(order[1:], int) - 1
     boxes = [rest.points[link] @ turn.T for link in order]

@@ -7,7 +7,8 @@ of float32 at a largest error of 0.01 mm for objects below 0.6 m, where float16 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -150,16 +151,16 @@ class Hdf5Dataset:
             category or split, or arrays that break the conventions.
         """
         path = Path(path)
-        if not path.is_file():
-            raise CaperError(f"{path}: no such file (format {FORMAT!r} is one .h5 file)")
-        try:
-            with h5py.File(path, "r") as file:
-                self.attributes = {key: _plain(value) for key, value in file.attrs.items()}
-                self.category = self._check_attributes(path, category, split)
-                keys = [*_fields(self.category), *(key for key in _OPTIONAL if key in file)]
-                arrays = {key: _read(path, file, key) for key in keys}
-        except OSError as error:
-            raise CaperError(f"{path}: truncated or not an HDF5 file ({error})") from error
+        with _opened(path) as file:
+            self.attributes = _read_attributes(path, file)
+            for key, wanted in (("category", category), ("split", split)):
+                if wanted is not None and self.attributes[key] != wanted:
+                    raise CaperError(
+                        f"{path}: holds {key} {self.attributes[key]!r}, not {wanted!r}"
+                    )
+            self.category = categories.registered(str(self.attributes["category"]))
+            keys = [*_fields(self.category), *(key for key in _OPTIONAL if key in file)]
+            arrays = {key: _read(path, file, key) for key in keys}
         _check_arrays(str(path), arrays, self.category)
         self.split = str(self.attributes["split"])
         self.mask_source = str(self.attributes["mask_source"])
@@ -168,6 +169,22 @@ class Hdf5Dataset:
             arrays.pop(key, None) for key in ("video", "frame", "instance")
         )
         self._arrays = arrays
+
+    @staticmethod
+    def categories_in(path: Path) -> list[str]:
+        """The category that a file holds.
+
+        Raises:
+          CaperError: truncated, not of this format, or of a category that is not registered.
+        """
+        with _opened(path) as file:
+            return [categories.registered(str(_read_attributes(path, file)["category"])).name]
+
+    @staticmethod
+    def splits_in(path: Path, category: str) -> list[str]:
+        """The split that a file holds."""
+        with _opened(path) as file:
+            return [str(_read_attributes(path, file)["split"])]
 
     @property
     def videos(self) -> dict[str, list[int]]:
@@ -193,24 +210,35 @@ class Hdf5Dataset:
             ),
             visible=arrays["visible"][index],
             visibility=arrays["visibility"][index] if "visibility" in arrays else None,
+            instance=None if self.instance is None else str(self.instance[index]),
         )
 
-    def _check_attributes(self, path: Path, category: str | None, split: str | None) -> Category:
-        facts = self.attributes
-        missing = [key for key in _REQUIRED if key not in facts]
-        if missing:
-            raise CaperError(
-                f"{path}: lacks the attribute {missing[0]!r}; not a file of format {FORMAT!r}"
-            )
-        if facts["format"] != FORMAT or facts["format_version"] != FORMAT_VERSION:
-            raise CaperError(
-                f"{path}: format {facts['format']!r} version {facts['format_version']}, this "
-                f"program reads {FORMAT!r} version {FORMAT_VERSION}; generate the file again"
-            )
-        for key, wanted in (("category", category), ("split", split)):
-            if wanted is not None and facts[key] != wanted:
-                raise CaperError(f"{path}: holds {key} {facts[key]!r}, not {wanted!r}")
-        return categories.registered(str(facts["category"]))
+
+@contextmanager
+def _opened(path: Path) -> Iterator[h5py.File]:
+    if not path.is_file():
+        raise CaperError(f"{path}: no such file (format {FORMAT!r} is one .h5 file)")
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except OSError as error:
+        raise CaperError(f"{path}: truncated or not an HDF5 file ({error})") from error
+
+
+def _read_attributes(path: Path, file: h5py.File) -> dict[str, Any]:
+    """What the file says about itself; CaperError where it is not of this format."""
+    facts = {key: _plain(value) for key, value in file.attrs.items()}
+    missing = [key for key in _REQUIRED if key not in facts]
+    if missing:
+        raise CaperError(
+            f"{path}: lacks the attribute {missing[0]!r}; not a file of format {FORMAT!r}"
+        )
+    if facts["format"] != FORMAT or facts["format_version"] != FORMAT_VERSION:
+        raise CaperError(
+            f"{path}: format {facts['format']!r} version {facts['format_version']}, this "
+            f"program reads {FORMAT!r} version {FORMAT_VERSION}; generate the file again"
+        )
+    return facts
 
 
 def _fields(category: Category) -> list[str]:

@@ -94,6 +94,7 @@ def labelled_frame(
     intrinsics: np.ndarray,
     truth: ArticulatedPose,
     num_points: int,
+    instance: str,
 ) -> Frame:
     """A frame from a depth image and the parts of its pixels.
 
@@ -104,6 +105,7 @@ def labelled_frame(
       intrinsics: [3, 3].
       truth: the pose.
       num_points: points of the cloud; none when too few pixels show the object.
+      instance: name of the object in the data set.
     """
     mask = labels >= 0
     points, pixels = np.zeros((0, 3), np.float32), np.zeros((0, 2), np.int32)
@@ -119,6 +121,7 @@ def labelled_frame(
         depth=depth,
         mask=mask,
         intrinsics=intrinsics,
+        instance=instance,
     )
 
 

@@ -42,6 +42,7 @@ class PmVideosDataset(ArtImageDataset):
     """
 
     format = FORMAT
+    _annotations = "train/*/annotations/*.json"
 
     def videos(self) -> dict[str, list[int]]:
         """Name of every video -> indices of its frames, in the order of time."""
@@ -66,7 +67,7 @@ class PmVideosDataset(ArtImageDataset):
         return self._model(str(annotation["instances"][0]["urdf_id"])).links.index(link)
 
     def _list_frames(self) -> dict[str, Path]:
-        paths = sorted((self._home / "train").glob("*/annotations/*.json"))
+        paths = sorted(self._home.glob(self._annotations))
         return {f"{path.parent.parent.name}/{path.stem}": path for path in paths}
 
     @cached_property

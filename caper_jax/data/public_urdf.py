@@ -49,7 +49,7 @@ def moving_joints(path: Path, child_of: Callable[[str], int | None]) -> list[Urd
       CaperError: missing or broken file, or a joint that lacks a name, axis or parent.
     """
     joints: dict[int, UrdfJoint] = {}
-    for element in _parse(path).iter("joint"):
+    for element in parse(path).iter("joint"):
         name, kind = element.get("name", ""), element.get("type", "")
         where = f"{path}, joint {name!r}"
         if kind in ("fixed", "0"):
@@ -59,16 +59,16 @@ def moving_joints(path: Path, child_of: Callable[[str], int | None]) -> list[Urd
             raise CaperError(f"{where}: the name must tell which link it moves")
         if child in joints:
             raise CaperError(f"{where}: a second joint moves link {child}")
-        axis = _vector(_attribute(element, "axis", "xyz", where), f"{where}, axis")
+        axis = vector(attribute(element, "axis", "xyz", where), f"{where}, axis")
         if not axis.any():
             raise CaperError(f"{where}: axis must not be zero")
         joints[child] = UrdfJoint(
             child=child,
-            parent=_attribute(element, "parent", "link", where),
+            parent=attribute(element, "parent", "link", where),
             kind="revolute" if kind == "continuous" else kind,
-            origin=_origin(element, "xyz", where),
+            origin=origin_of(element, "xyz", where),
             axis=axis,
-            limits=_limits(element, where),
+            limits=limits_of(element, where),
         )
     return [joints[child] for child in sorted(joints)]
 
@@ -79,11 +79,11 @@ def base_joint(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
       CaperError: missing or broken file, or no such joint.
     """
-    for element in _parse(path).iter("joint"):
+    for element in parse(path).iter("joint"):
         name = element.get("name", "")
         if name.split("_")[1:2] == ["0"]:
             where = f"{path}, joint {name!r}"
-            return _origin(element, "xyz", where), _origin(element, "rpy", where)
+            return origin_of(element, "xyz", where), origin_of(element, "rpy", where)
     raise CaperError(f"{path}: lacks the base joint (name <text>_0)")
 
 
@@ -93,7 +93,12 @@ def number_of(name: str) -> int | None:
     return None if match is None else int(match[1])
 
 
-def _parse(path: Path) -> ElementTree.Element:
+def parse(path: Path) -> ElementTree.Element:
+    """The outermost element of a file.
+
+    Raises:
+      CaperError: missing file or broken XML.
+    """
     if not path.is_file():
         raise CaperError(f"{path}: no such file")
     try:
@@ -102,21 +107,23 @@ def _parse(path: Path) -> ElementTree.Element:
         raise CaperError(f"{path}: broken XML ({error})") from error
 
 
-def _attribute(element: ElementTree.Element, tag: str, name: str, where: str) -> str:
+def attribute(element: ElementTree.Element, tag: str, name: str, where: str) -> str:
+    """An attribute of a child element; CaperError without it."""
     child = element.find(tag)
     if child is None or child.get(name) is None:
         raise CaperError(f"{where}: lacks <{tag} {name}=...>")
     return str(child.get(name))
 
 
-def _origin(element: ElementTree.Element, name: str, where: str) -> np.ndarray:
+def origin_of(element: ElementTree.Element, name: str, where: str) -> np.ndarray:
     """[3] of an <origin>, which is zero where it is left out."""
     origin = element.find("origin")
     text = "0 0 0" if origin is None else origin.get(name, "0 0 0")
-    return _vector(text, f"{where}, origin {name}")
+    return vector(text, f"{where}, origin {name}")
 
 
-def _vector(text: str, where: str) -> np.ndarray:
+def vector(text: str, where: str) -> np.ndarray:
+    """[3] finite numbers from text; CaperError for anything else."""
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError as error:
@@ -126,9 +133,10 @@ def _vector(text: str, where: str) -> np.ndarray:
     return values
 
 
-def _limits(element: ElementTree.Element, where: str) -> tuple[float, float] | None:
+def limits_of(element: ElementTree.Element, where: str) -> tuple[float, float] | None:
+    """(low, high) of a joint's <limit>; None where the file has none."""
     limit = element.find("limit")
     if limit is None or limit.get("lower") is None or limit.get("upper") is None:
         return None
-    low, high, _ = _vector(f"{limit.get('lower')} {limit.get('upper')} 0", f"{where}, limit")
+    low, high, _ = vector(f"{limit.get('lower')} {limit.get('upper')} 0", f"{where}, limit")
     return float(low), float(high)

@@ -44,7 +44,6 @@ TEST_OBJECTS = {
     "drawer": (30, 31),
     "scissors": (40, 41),
 }
-_FOLDERS = {"scissors": "scissor"}
 
 
 class ReArtVideosDataset:
@@ -84,7 +83,7 @@ class ReArtVideosDataset:
         self.category: Category = categories.get(category)
         if self.category.name not in CONVERSIONS:
             raise unknown_name("ReArt-Videos category", self.category.name, CONVERSIONS)
-        self._folder = _FOLDERS.get(self.category.name, self.category.name)
+        self._folder = _folder(self.category.name)
         self.split = split or ALL
         self._num_points = num_points
         self._annotations = self.root / "Data" / "new_anno_test" / self._folder
@@ -104,6 +103,18 @@ class ReArtVideosDataset:
         if not self.names:
             raise CaperError(f"{self._annotations}: split {self.split!r} holds no frame")
 
+    @staticmethod
+    def categories_in(root: Path) -> list[str]:
+        """Our names of the categories that a root holds and that can be read."""
+        folder = root / "Data" / "new_anno_test"
+        return [name for name in CONVERSIONS if any((folder / _folder(name)).glob("*/*.json"))]
+
+    @staticmethod
+    def splits_in(root: Path, category: str) -> list[str]:
+        """Splits that a root lists frames of, for one category."""
+        folder = root / "Data" / "new_anno_test" / "flag" / _folder(category)
+        return sorted(path.stem for path in folder.glob("*.txt"))
+
     def __len__(self) -> int:
         return len(self.names)
 
@@ -116,12 +127,13 @@ class ReArtVideosDataset:
         numbers = [link.get("link_category_id") for link in instance["links"]]
         first = 0 if 0 in numbers else 1  # ReArt-48 counts from 1
         links = ordered_links(instance, self.category.num_parts, where, first, keys)
-        model = self._model(str(instance["urdf_id"]))
+        urdf_id = str(instance["urdf_id"])
+        model = self._model(urdf_id)
         truth = pose_of_links(model, links, self.category, where, scaled=True)
         depth = read_depth(self.root / "Data" / "depth" / annotation["depth_path"])
         labels = polygon_labels(links, depth.shape, where)
         intrinsics = self._intrinsics(self._camera, depth.shape)
-        return labelled_frame(name, depth, labels, intrinsics, truth, self._num_points)
+        return labelled_frame(name, depth, labels, intrinsics, truth, self._num_points, urdf_id)
 
     def videos(self) -> dict[str, list[int]]:
         """Name of every video -> indices of its frames, in the order of time."""
@@ -178,6 +190,10 @@ class ReArtVideosDataset:
         if not joints:
             raise CaperError(f"{urdf}: no joint moves")
         return read_model(meta, self.category, CONVERSIONS[self.category.name], str(urdf))
+
+
+def _folder(category: str) -> str:
+    return {"scissors": "scissor"}.get(category, category)
 
 
 def _child(name: str) -> int | None:

@@ -14,7 +14,8 @@ positive states open). What is known of rest poses and what is judged: reartmix_
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -23,12 +24,13 @@ from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.data.images import read_depth, read_intrinsics, read_json
 from caper_jax.data.links import labelled_frame, ordered_links, polygon_labels, pose_of_links
-from caper_jax.data.reartmix_models import Model, conversion_of, read_model
+from caper_jax.data.reartmix_models import CONVERSIONS, Model, conversion_of, read_model
 from caper_jax.data.schema import Frame
 from caper_jax.errors import CaperError
 
 FORMAT = "reartmix"
 ALL = "all"
+_CATEGORY_ID = re.compile(rb'"category_id"\s*:\s*(\d+)')
 _INSTANCE_KEYS = ("id", "category_id", "urdf_id", "links")
 
 
@@ -46,7 +48,12 @@ class ReArtMixDataset:
     mask_source = "annotated polygons"
 
     def __init__(
-        self, root: str | Path, category: str, split: str | None = None, num_points: int = 1024
+        self,
+        root: str | Path,
+        category: str,
+        split: str | None = None,
+        num_points: int = 1024,
+        on_broken: Callable[[CaperError], None] | None = None,
     ):
         """Lists the instances; depth and polygons are read frame by frame.
 
@@ -56,6 +63,8 @@ class ReArtMixDataset:
             the others in the images are left out.
           split: "train" or "test" for the instances of <split>.txt; None or "all" for all.
           num_points: points per frame.
+          on_broken: called with the error of every annotation that cannot be read, whose
+            instances then are left out; by default the error is raised.
 
         Raises:
           CaperError: not a ReArtMix folder, a split it does not have, a category it does not hold
@@ -69,10 +78,28 @@ class ReArtMixDataset:
                 raise CaperError(f"{self.root}: no ReArtMix folder (it lacks {name}/)")
         self.split = split or ALL
         self._num_points = num_points
+        self._on_broken = on_broken
         self._intrinsics = read_intrinsics(self.root / "camera_intrinsic.json")
         self._models = self._load_models()
         self.names: Sequence[str] = self._list_names()
         self._annotation = lru_cache(maxsize=4)(self._read_annotation)
+
+    @staticmethod
+    def categories_in(root: Path) -> list[str]:
+        """Our names of the categories that annotations of a root show and that can be read."""
+        known = {str(c.category_id).encode(): name for name, c in CONVERSIONS.items()}
+        present: set[bytes] = set()
+        for path in sorted((root / "annotations").glob("**/*.json")):
+            # Annotations are long (polygons) and often show the same categories.
+            present |= set(_CATEGORY_ID.findall(path.read_bytes())) & set(known)
+            if len(present) == len(known):
+                break
+        return sorted(known[number] for number in present)
+
+    @staticmethod
+    def splits_in(root: Path, category: str) -> list[str]:
+        """Splits that a root lists, of all categories together."""
+        return sorted(path.stem for path in root.glob("*.txt"))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -91,7 +118,15 @@ class ReArtMixDataset:
         truth = pose_of_links(model, links, self.category, where, scaled=True)
         depth = read_depth(self.root / "depth" / annotation["depth_path"])
         labels = polygon_labels(links, depth.shape, where)
-        return labelled_frame(name, depth, labels, self._intrinsics, truth, self._num_points)
+        return labelled_frame(
+            name,
+            depth,
+            labels,
+            self._intrinsics,
+            truth,
+            self._num_points,
+            str(instance["urdf_id"]),
+        )
 
     def _load_models(self) -> dict[int, Model]:
         path = self.root / "urdf_metas.json"
@@ -130,10 +165,21 @@ class ReArtMixDataset:
             wanted = path.read_text(encoding="utf-8").split()
             images = list(dict.fromkeys(name.rpartition("_")[0] for name in wanted))
         found: dict[str, bool] = {}
+        broken: set[str] = set()
         for image in images:
-            for instance in self._read_annotation(image)["instances"]:
+            try:
+                annotation = self._read_annotation(image)
+            except CaperError as error:
+                if self._on_broken is None:
+                    raise
+                self._on_broken(error)
+                broken.add(image)
+                continue
+            for instance in annotation["instances"]:
                 ours = instance["category_id"] == self._conversion.category_id
                 found[f"{image}_{instance['id']}"] = ours
+        if broken and wanted is not None:
+            wanted = [name for name in wanted if name.rpartition("_")[0] not in broken]
         unknown = [name for name in wanted or () if name not in found]
         if unknown:
             raise CaperError(f"{path}: names {unknown[0]!r}, which no annotation describes")

@@ -17,7 +17,7 @@ images:
 - scissors: the blades cross at 90 deg, along y and x. A handle's loop lies on the outer side of
   its blade's line, which settles the way they close (the second turns by +z towards the first)
   but not which ends are the tips: a half turn about the pivot gives the same boxes. They are taken
-  to be those at +y and +x, nearer the pivot or as near in all models but one (by 1 mm): the
+  to be those at +y and +x, nearer the pivot or as near in all models but one (by 2 mm): the
   handles of paper scissors reach at least as far as their blades. The boxes are turned by 10 deg
   to our rest pose and enclose the parts more loosely there. The first link is the root.
 

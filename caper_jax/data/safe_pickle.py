@@ -3,15 +3,18 @@
 A pickle is a program: it may import and call anything, and even numpy's own ``__setstate__`` takes
 memory layouts on trust. So nothing that a file names is imported here. Arrays, scalars and dtypes
 are rebuilt from their bytes by this module; beside them only dictionaries, lists, tuples, sets,
-text, bytes and numbers are read.
+text, bytes and numbers are read. An .npz whose array holds objects is a pickle in a zip file, and
+is read in the same way.
 """
 
 from __future__ import annotations
 
+import io
 import pickle
+import zipfile
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -37,15 +40,61 @@ def load(path: str | Path) -> Any:
     if not path.is_file():
         raise CaperError(f"{path}: no such file")
     with path.open("rb") as file:
-        try:
-            return _plain(_Unpickler(file, encoding="latin1").load())
-        except _ForbiddenError as error:
-            raise CaperError(
-                f"{path}: the pickle asks for {error}, but only numpy arrays and plain containers "
-                "are read; do not open this file with other programs unless you trust it"
-            ) from error
-        except Exception as error:  # a broken pickle fails in any way that Python can
-            raise CaperError(f"{path}: broken pickle ({type(error).__name__}: {error})") from error
+        return _read(file, _Unpickler, str(path))
+
+
+def load_npz(path: str | Path, key: str) -> Any:
+    """Reads one array of an .npz; an array of objects through the restricted unpickler.
+
+    Args:
+      path: the file.
+      key: name of the array.
+
+    Returns:
+      The array; for an array of objects without axes (a dictionary that was saved), the object.
+
+    Raises:
+      CaperError: missing or broken file, no such array, or objects that are no numpy arrays or
+        plain containers (named).
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaperError(f"{path}: no such file")
+    where = f"{path}, {key!r}"
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+            if key not in names:
+                raise CaperError(f"{path}: lacks {key!r}, it holds {', '.join(names) or 'nothing'}")
+            content = io.BytesIO(archive.read(f"{key}.npy"))
+        version = np.lib.format.read_magic(content)
+        if version == (1, 0):
+            header = np.lib.format.read_array_header_1_0(content)
+        else:
+            header = np.lib.format.read_array_header_2_0(content)
+        if not header[2].hasobject:
+            content.seek(0)
+            return np.lib.format.read_array(content, allow_pickle=False)
+    except CaperError:
+        raise
+    except Exception as error:  # zip, zlib and numpy each have their own
+        raise CaperError(f"{where}: broken or no .npz file ({error})") from error
+    array = _read(content, _ObjectsUnpickler, where)
+    if not isinstance(array, np.ndarray) or array.shape != header[0]:
+        raise CaperError(f"{where}: the pickle holds no array of shape {header[0]}")
+    return array[()]
+
+
+def _read(file: IO[bytes], unpickler: type[_Unpickler], where: str) -> Any:
+    try:
+        return _plain(unpickler(file, encoding="latin1").load())
+    except _ForbiddenError as error:
+        raise CaperError(
+            f"{where}: the pickle asks for {error}, but only numpy arrays and plain containers "
+            "are read; do not open this file with other programs unless you trust it"
+        ) from error
+    except Exception as error:  # a broken pickle fails in any way that Python can
+        raise CaperError(f"{where}: broken pickle ({type(error).__name__}: {error})") from error
 
 
 class _ForbiddenError(Exception):
@@ -57,10 +106,20 @@ class _Unpickler(pickle.Unpickler):
         place = module.replace("numpy.core.", "numpy._core.")
         if (place, name) not in _KNOWN:
             raise _ForbiddenError(f"{module}.{name}")
-        return _KNOWN[place, name]
+        return self._replacement(place, name)
+
+    def _replacement(self, module: str, name: str) -> Any:
+        return _KNOWN[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
         raise _ForbiddenError(f"an object outside the file ({pid!r})")
+
+
+class _ObjectsUnpickler(_Unpickler):
+    """Also reads arrays of objects, which themselves must be what is read."""
+
+    def _replacement(self, module: str, name: str) -> Any:
+        return _ObjectArray if name == "ndarray" else super()._replacement(module, name)
 
 
 class _Dtype:
@@ -92,6 +151,20 @@ class _Array:
         self.value = _from_bytes(data, dtype, shape, "F" if by_column else "C")
 
 
+class _ObjectArray(_Array):
+    """An array whose data may be a list of objects."""
+
+    def __setstate__(self, state: tuple) -> None:
+        _, shape, dtype, by_column, data = state
+        if not (isinstance(dtype, _Dtype) and dtype.code in ("O", "O8") and isinstance(data, list)):
+            super().__setstate__(state)
+            return
+        flat = np.empty(len(data), object)
+        for index, item in enumerate(data):
+            flat[index] = item
+        self.value = flat.reshape(shape, order="F" if by_column else "C")
+
+
 def _from_bytes(data: Any, dtype: Any, shape: Any, order: str) -> np.ndarray:
     if not isinstance(dtype, _Dtype):
         raise _ForbiddenError(f"an array of dtype {dtype!r}")
@@ -103,7 +176,7 @@ def _from_bytes(data: Any, dtype: Any, shape: Any, order: str) -> np.ndarray:
 
 
 def _reconstruct(kind: Any, shape: Any, code: Any) -> _Array:
-    return _Array()
+    return _ObjectArray() if kind is _ObjectArray else _Array()
 
 
 def _scalar(dtype: Any, data: Any = b"") -> Any:
@@ -145,6 +218,9 @@ _KNOWN: dict[tuple[str, str], Any] = {
 def _plain(value: Any) -> Any:
     """The value with its arrays in place of what stood for them."""
     if isinstance(value, _Array):
+        if value.value.dtype == object:
+            for index in np.ndindex(value.value.shape):
+                value.value[index] = _plain(value.value[index])
         return value.value
     if isinstance(value, dict):
         return {_plain(key): _plain(item) for key, item in value.items()}

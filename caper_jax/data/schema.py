@@ -41,6 +41,8 @@ class Frame:
       depth: [H, W] float32 metres, for pictures; None when the data has no image.
       mask: [H, W] bool, the object in ``depth``.
       intrinsics: [3, 3] of ``depth``.
+      instance: which object is shown, by its name in the data set (urdf_id, PartNet id, number of
+        a generated shape); None when unknown.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Frame:
     depth: np.ndarray | None = None
     mask: np.ndarray | None = None
     intrinsics: np.ndarray | None = None
+    instance: str | None = None
 
 
 class Dataset(Protocol):
@@ -101,11 +104,17 @@ def validate(frame: Frame, category: Category) -> None:
       CaperError: shapes, dtypes, non-finite numbers, rotations that are none, parts that their
         joints cannot bring to where they are; all of them in one message.
     """
+    problems = frame_problems(frame, category)
+    if problems:
+        raise CaperError(f"frame {frame.name!r} of {category.name}: {'; '.join(problems)}")
+
+
+def frame_problems(frame: Frame, category: Category) -> list[str]:
+    """What is wrong with a frame, one phrase per problem; empty when all is well."""
     problems = _cloud_problems(frame, category.num_parts)
     if frame.truth is not None:
         problems += pose_problems(frame.truth, category)
-    if problems:
-        raise CaperError(f"frame {frame.name!r} of {category.name}: {'; '.join(problems)}")
+    return problems
 
 
 def pose_problems(pose: ArticulatedPose, category: Category) -> list[str]:

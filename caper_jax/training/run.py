@@ -153,7 +153,13 @@ def _fit_dataset(
     fit_task: Callable[..., FitResult], config: RunConfig, source: LoaderConfig
 ) -> tuple[FitResult, LabelledClouds]:
     """Trains on a dataset; also some of its frames."""
-    dataset = open_dataset(source.format, source.root, config.category, source.split)
+    dataset = open_dataset(
+        source.format,
+        source.root,
+        config.category,
+        source.split,
+        num_points=4 * config.network.num_points,  # every epoch picks others of them
+    )
     arguments = (config.network.num_points, config.training.seed)
     with Loader(
         dataset,
