@@ -323,7 +323,7 @@ def test_scissors(root, tmp_path, metas, model):
     # A tilted axis takes the second blade a little out of the plane.
     assert way(truth, (cos, 0, -sin), part=1) @ second[:, 0] > 0.99
     assert truth.joint_axis[0, 1] > 0.99
-    # Handles reach at least as far as blades, but for one model by a millimetre.
+    # Handles reach at least as far as blades, but for one model by two millimetres.
     _, one, two = stored_boxes(meta)
     assert -one[0, 1] > one[1, 1] - 0.0015 and -two[0, 0] > two[1, 0] - 0.0025
 
