@@ -79,7 +79,7 @@ def test_pose_is_printed_and_written(files, seen, capsys):
         expected = np.degrees(expected) if key == "joint_state" else expected
         np.testing.assert_allclose(result["pose"][key], expected, rtol=1e-6)
     table = capsys.readouterr().out
-    assert f"{np.degrees(pose.joint_state[0]):.4g} degrees" in table
+    assert f"{np.degrees(pose.joint_state[0]):.1f}°" in table
     assert " ".join(f"{value:.3f}" for value in pose.translation[1]) in table
     assert "1999 points, 1 dropped" in table
     assert max(map(len, table.splitlines())) <= 80

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from caper_jax.articulation.pose import ArticulatedPose
     from caper_jax.data.cloud import Cloud
     from caper_jax.estimator import Prediction
+    from caper_jax.visualization.scene import Scene
 
 FRAME = "camera, OpenCV: x right, y down, z forward; p_camera = rotation p + translation"
 NUM_POINTS = 1024
@@ -85,6 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     observation = _observe(arguments)
 
     from caper_jax.estimator import load
+    from caper_jax.visualization.table import format_scene
 
     estimator = load(category.name, arguments.weights)
     prediction = estimator(observation.cloud.points[None])
@@ -94,7 +96,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise CaperError("the model gave no finite pose for this object; check mask and units")
 
     cloud = observation.cloud
-    print(_format_pose(pose, category))
+    scene = _scene(arguments, category, observation, prediction)
+    print(format_scene(scene))
     print(
         f"confidence {' '.join(f'{value:.2f}' for value in confidence)}; {cloud.available} points, "
         f"{cloud.dropped} dropped"
@@ -106,8 +109,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         text = json.dumps(_as_json(pose, category, cloud, confidence), indent=2, allow_nan=False)
         write_atomically(arguments.json, text.encode() + b"\n")
-    if arguments.picture is not None or arguments.page is not None:
-        _draw(arguments, category, observation, prediction)
+    if arguments.picture is not None:
+        from caper_jax.visualization.picture import write_picture
+
+        write_picture(arguments.picture, [scene])
+    if arguments.page is not None:
+        from caper_jax.visualization.page import write_page
+
+        write_page(arguments.page, [scene])
     return 0
 
 
@@ -166,41 +175,12 @@ def _observe(arguments: argparse.Namespace) -> _Observation:
     return _Observation(cloud, depth, mask, intrinsics)
 
 
-def _format_pose(pose: ArticulatedPose, category: Category) -> str:
-    """Tables of parts and joints; metres, degrees."""
-    import jax
-
-    from caper_jax.evaluation.report import align
-    from caper_jax.geometry import so3
-
-    with jax.enable_x64(True):
-        turns = np.degrees(np.asarray(jax.jit(so3.log)(pose.rotation.astype(np.float64))))
-    rows = [["part", "position [m]", "rotation vector [deg]", "size [m]"]]
-    for k, name in enumerate(category.parts):
-        rows.append(
-            [name, _triple(pose.translation[k], 3), _triple(turns[k], 1), _triple(pose.size[k], 3)]
-        )
-    lines = align(rows)
-    rows = [["joint", "state", "axis (root frame)", "pivot [m]"]]
-    for j, joint in enumerate(category.joints):
-        state, unit = _state(pose, category, j)
-        pivot = _triple(pose.joint_pivot[j], 3) if joint.type == "revolute" else "-"
-        rows.append(
-            [category.parts[j + 1], f"{state:.4g} {unit}", _triple(pose.joint_axis[j], 3), pivot]
-        )
-    return "\n".join([*lines, "", *align(rows)])
-
-
 def _state(pose: ArticulatedPose, category: Category, joint: int) -> tuple[float, str]:
     """State of a joint in the unit of files and tables."""
     value = float(pose.joint_state[joint])
     if category.joint_types[joint] == "revolute":
         return float(np.degrees(value)), "degrees"
     return value, "metres"
-
-
-def _triple(values: np.ndarray, digits: int) -> str:
-    return " ".join(f"{value:.{digits}f}" for value in values)
 
 
 def _as_json(
@@ -222,17 +202,18 @@ def _as_json(
     }
 
 
-def _draw(
+def _scene(
     arguments: argparse.Namespace,
     category: Category,
     observation: _Observation,
     prediction: Prediction,
-) -> None:
+) -> Scene:
+    """The estimate with what it was made from, to print and to draw."""
     from caper_jax.visualization.scene import Scene
 
     depth = observation.depth
     source: Path = arguments.depth or arguments.points
-    scene = Scene(
+    return Scene(
         name=source.name,
         category=category,
         points=prediction.points,
@@ -242,11 +223,3 @@ def _draw(
         mask=observation.mask,
         intrinsics=observation.intrinsics,
     )
-    if arguments.picture is not None:
-        from caper_jax.visualization.picture import write_picture
-
-        write_picture(arguments.picture, [scene])
-    if arguments.page is not None:
-        from caper_jax.visualization.page import write_page
-
-        write_page(arguments.page, [scene])
