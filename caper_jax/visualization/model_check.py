@@ -103,14 +103,16 @@ def _draw_view(
     right, down = np.meshgrid(steps * half + middle[0], -steps * half + middle[1])
     start = seen[:, 2].max() + half
     origins = np.stack([right, down, np.full_like(right, start)], -1).reshape(-1, 3) @ view
-    reach, normals = caster.cast(poses, origins, np.tile(-view[2], (len(origins), 1)))
-    part = reach.argmin(0)
-    hit = np.isfinite(reach.min(0))
-    normal = np.take_along_axis(normals, part[None, :, None], 0)[0]
+    reach, faces = caster.cast(poses, origins, np.tile(-view[2], (len(origins), 1)))
+    part = np.where(np.isfinite(reach.min(0)), reach.argmin(0), -1)
     light = view.T @ np.array([-0.35, 0.5, 0.79])
-    shade = 0.35 + 0.65 * np.clip(normal @ light, 0.0, 1.0)
-    colors = np.array([to_rgb(part_color(k)) for k in range(len(poses))])
-    image = np.where(hit[:, None], colors[part] * shade[:, None], 1.0)
+    image = np.ones((len(origins), 3))
+    for k, pose in enumerate(poses):
+        shown = part == k
+        normal = caster.normals(k, faces[k, shown], pose)
+        normal *= np.sign(normal @ view[2])[:, None]
+        shade = 0.35 + 0.65 * np.clip(normal @ light, 0.0, 1.0)
+        image[shown] = np.array(to_rgb(part_color(k))) * shade[:, None]
     extent = (middle[0] - half, middle[0] + half, middle[1] - half, middle[1] + half)
     axis.imshow(image.reshape(PIXELS, PIXELS, 3), extent=extent, interpolation="nearest")
     for index, (name, color) in enumerate(zip("xyz", AXIS_COLORS, strict=True)):
@@ -118,7 +120,10 @@ def _draw_view(
     reference = item.reference
     for joint, parent in enumerate(reference.parents):
         carrier = poses[parent]
-        pivot = carrier[:3, :3] @ reference.pivot[joint] + carrier[:3, 3]
+        # A slide has no place of its own: drawn through the middle of what it carries.
+        slides = reference.kinds[joint] == "prismatic"
+        place = item.box_center[joint + 1] if slides else reference.pivot[joint]
+        pivot = carrier[:3, :3] @ place + carrier[:3, 3]
         along = carrier[:3, :3] @ reference.axis[joint]
         _arrow(axis, view @ pivot, view @ along * 0.3 * half, "black", str(joint + 1))
     axis.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])

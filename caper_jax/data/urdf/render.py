@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -40,15 +41,19 @@ class PartCaster:
             from trimesh.ray.ray_pyembree import RayMeshIntersector
         except ImportError:
             raise CaperError(f"rendering meshes {NEEDS_MESH}") from None
-        self._parts = [part.vertices[part.faces] for part in parts]
+        self._corners = [part.vertices[part.faces] for part in parts]
         self._normals = [
             np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            for corners in self._parts
+            for corners in self._corners
         ]
-        self._scenes = [
-            RayMeshIntersector(trimesh.Trimesh(part.vertices, part.faces, process=False))
-            for part in parts
-        ]
+        meshes = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts]
+        self._scenes = [RayMeshIntersector(mesh) for mesh in meshes]
+        self._spheres = []
+        for part in parts:
+            middle = part.bounds().mean(0)
+            radius = np.linalg.norm(part.vertices - middle, axis=-1).max()
+            self._spheres.append((middle, 1.001 * radius))
+        self.outlines = [_outline(mesh) for mesh in meshes]
 
     def cast(
         self, poses: np.ndarray, origins: np.ndarray, directions: np.ndarray
@@ -61,27 +66,40 @@ class PartCaster:
 
         Returns:
           [K, R] multiples of the direction, infinite without a hit (the depth, for directions
-          with z = 1 from the camera), and [K, R, 3] normals there, towards where the ray comes
-          from, in the frame of the rays.
+          with z = 1 from the camera), and [K, R] the triangle met, -1 for none.
         """
         reach = np.full((len(poses), len(directions)), np.inf)
-        normals = np.zeros((len(poses), len(directions), 3))
+        faces = np.full((len(poses), len(directions)), -1)
         for k, pose in enumerate(np.asarray(poses, np.float64)):
             start = (origins - pose[:3, 3]) @ pose[:3, :3]
             ray = directions @ pose[:3, :3]
-            face = self._scenes[k].intersects_first(start, ray)
-            hit = np.flatnonzero(face >= 0)
+            middle, radius = self._spheres[k]
+            aside = np.cross(middle - start, ray)
+            near = np.flatnonzero((aside**2).sum(-1) <= radius**2 * (ray**2).sum(-1))
+            if not len(near):
+                continue
+            face = self._scenes[k].intersects_first(start[near], ray[near])
+            hit, face = near[face >= 0], face[face >= 0]
             # Embree answers in float32; the plane of the triangle gives the place exactly.
-            normal, corner = self._normals[k][face[hit]], self._parts[k][face[hit], 0]
-            slope = (normal * ray[hit]).sum(-1)
+            normal, corner = self._normals[k][face], self._corners[k][face, 0]
             with np.errstate(divide="ignore", invalid="ignore"):
-                along = (normal * (corner - start[hit])).sum(-1) / slope
+                along = (normal * (corner - start[hit])).sum(-1) / (normal * ray[hit]).sum(-1)
             good = np.isfinite(along) & (along > 0)
-            hit, normal, slope = hit[good], normal[good], slope[good]
-            reach[k, hit] = along[good]
-            facing = -np.sign(slope)[:, None] * normal / np.linalg.norm(normal, axis=-1)[:, None]
-            normals[k, hit] = facing @ pose[:3, :3].T
-        return reach, normals
+            reach[k, hit[good]], faces[k, hit[good]] = along[good], face[good]
+        return reach, faces
+
+    def normals(self, part: int, faces: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Unit normals [R, 3] of triangles of a part under a pose [4, 4], of either sign."""
+        normal = self._normals[part][faces] @ pose[:3, :3].T
+        return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def _outline(mesh: Any) -> np.ndarray:
+    """[V, 3] the corners of a mesh's convex hull; all vertices of a flat mesh, which has none."""
+    try:
+        return np.asarray(mesh.convex_hull.vertices)
+    except (ImportError, ValueError, RuntimeError):
+        return np.asarray(mesh.vertices)
 
 
 def render_frames(
@@ -118,15 +136,14 @@ def render_frames(
     bank = _bank(objects)
     frame_keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(np.arange(frames))
     instances = jax.tree.map(lambda values: values[instance], bank)
-    keys, states, poses, offsets = _draw(frame_keys, instances, category, num_points)
-    states, poses = np.asarray(states), np.asarray(poses)
+    keys, *drawn = _draw(frame_keys, instances, category, num_points)
+    states, poses, grid_offsets, picks = map(np.asarray, drawn)
     rows = []
     for index in range(frames):
         which = instance[index]
-        rays = _ray_grid(objects[which], poses[index], np.asarray(offsets.grid[index]), grid)
-        frame_keys = jax.tree.map(lambda values, i=index: values[i], keys)
-        pick = np.asarray(offsets.pick[index])
-        rows.append(_observe(frame_keys, casters[which], poses[index], rays, mix, pick))
+        caster = casters[which]
+        rays = _ray_grid(caster.outlines, poses[index], grid_offsets[index], grid)
+        rows.append(_observe(keys, index, caster, poses[index], rays, mix, picks[index]))
         report(1)
     points, labels, visible, visibility = (np.stack(column) for column in zip(*rows, strict=True))
     pose = ArticulatedPose(
@@ -164,23 +181,20 @@ def _draw(frame_keys, instances: Bank, category: Category, num_points: int):
     def one(key, instance):
         keys = Keys(*jax.random.split(key, 8))
         state, poses, _ = draw_state_and_poses(keys.scene, instance, category)
-        offsets = keys._replace(
-            grid=jax.random.uniform(keys.grid, (2,)),
-            pick=jax.random.uniform(keys.pick, (num_points,)),
-        )
-        return keys, state, poses, offsets
+        grid = jax.random.uniform(keys.grid, (2,))
+        return keys, state, poses, grid, jax.random.uniform(keys.pick, (num_points,))
 
     return jax.vmap(one)(frame_keys, instances)
 
 
 def _ray_grid(
-    item: ImportedObject, poses: np.ndarray, offset: np.ndarray, grid: int
+    outlines: Sequence[np.ndarray], poses: np.ndarray, offset: np.ndarray, grid: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rays (x [G, G], y [G, G]) over the object's projection on the plane z = 1."""
     plane = []
-    for part, pose in zip(item.reference.parts, poses, strict=True):
-        points = part.moved(pose.astype(np.float64)).vertices
-        points = points[points[:, 2] > 1e-3 * item.size.max()]
+    for outline, pose in zip(outlines, poses.astype(np.float64), strict=True):
+        points = outline @ pose[:3, :3].T + pose[:3, 3]
+        points = points[points[:, 2] > 0.01 * points[:, 2].max()]
         plane.append(points[:, :2] / points[:, 2:])
     corners = np.concatenate(plane)
     low, high = corners.min(0), corners.max(0)
@@ -188,7 +202,9 @@ def _ray_grid(
     return np.meshgrid(x, y, indexing="xy")
 
 
-def _observe(keys: Keys, caster: PartCaster, poses: np.ndarray, rays, mix, pick: np.ndarray):
+def _observe(
+    keys: Keys, frame: int, caster: PartCaster, poses: np.ndarray, rays, mix, pick: np.ndarray
+):
     """Points [N, 3], labels [N], and pixels and unhidden share [K] of each part."""
     directions = np.stack([*rays, np.ones_like(rays[0])], axis=-1).reshape(-1, 3)
     reach, _ = caster.cast(poses, np.zeros_like(directions), directions)
@@ -201,23 +217,23 @@ def _observe(keys: Keys, caster: PartCaster, poses: np.ndarray, rays, mix, pick:
     image = rays[0].shape
     depth = np.where(hit, nearest, 0.0).astype(np.float32).reshape(image)
     rays = tuple(ray.astype(np.float32) for ray in rays)
-    sensor, surface, seen = _sense(keys, mix, depth, hit.reshape(image), rays)
+    sensor, surface, seen = _sense(keys, frame, mix, depth, hit.reshape(image), rays)
     found = np.flatnonzero(np.asarray(seen))
     found = found if len(found) else np.flatnonzero(hit)
     # Evenly spread in raster order, repeating when there are too few.
     index = found[((np.arange(len(pick)) + pick) * len(found) / len(pick)).astype(np.int64)]
     chosen = jax.tree.map(lambda values: np.asarray(values).ravel()[index], surface)
-    points = _measure(keys, sensor, chosen, (rays[0].ravel()[index], rays[1].ravel()[index]))
+    points = _measure(keys, frame, sensor, chosen, (rays[0].ravel()[index], rays[1].ravel()[index]))
     return np.asarray(points), part[index].astype(np.int32), visible, visible / np.maximum(alone, 1)
 
 
 @jax.jit
-def _sense(keys: Keys, mix, depth, hit, rays):
-    sensor = sensors.draw(keys.sensor, mix)
+def _sense(keys: Keys, frame, mix, depth, hit, rays):
+    sensor = sensors.draw(keys.sensor[frame], mix)
     surface = sensors.surface(depth, hit, rays)
-    return sensor, surface, sensors.lose(keys.loss, sensor, surface, hit)
+    return sensor, surface, sensors.lose(keys.loss[frame], sensor, surface, hit)
 
 
 @jax.jit
-def _measure(keys: Keys, sensor, chosen, rays):
-    return sensors.measure(keys.noise, sensor, chosen, rays)
+def _measure(keys: Keys, frame, sensor, chosen, rays):
+    return sensors.measure(keys.noise[frame], sensor, chosen, rays)
