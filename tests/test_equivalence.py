@@ -163,7 +163,7 @@ def test_is_ambiguous_compares_what_changes_places():
     like = np.array([[0.22, 0.02, 0.09], [0.22, 0.017, 0.09]])
     deep = np.array([[0.22, 0.12, 0.09], [0.22, 0.01, 0.09]])
     np.testing.assert_array_equal(is_ambiguous(np.stack([like, deep]), box), [True, False])
-    assert not is_ambiguous(like, box, tolerance=0.1)
+    assert not is_ambiguous(like, dataclasses.replace(box, tolerance=0.1))
     # At rest a lid stands: its height is the depth of the base, its thickness the other's height.
     plates = np.array([[0.33, 0.012, 0.23], [0.33, 0.22, 0.010]])
     thick = np.array([[0.33, 0.030, 0.23], [0.33, 0.22, 0.008]])

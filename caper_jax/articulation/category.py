@@ -39,11 +39,14 @@ class Equivalence:
       permutation: part k of the second reading is part ``permutation[k]`` of the first.
       turn: [3, 3] rotation of the canonical frame.
       reason: for people.
+      tolerance: largest relative difference of any extent of the exchanged parts at which an
+        instance still looks the same under both readings.
     """
 
     permutation: tuple[int, ...]
     turn: tuple[tuple[float, float, float], ...]
     reason: str
+    tolerance: float = 0.3
 
 
 @dataclass(frozen=True)

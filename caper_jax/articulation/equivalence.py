@@ -75,13 +75,12 @@ def second_labels(labels, equivalence: Equivalence):
     return jnp.where(labels < 0, labels, jnp.asarray(inverse)[jnp.maximum(labels, 0)])
 
 
-def is_ambiguous(size, equivalence: Equivalence, tolerance: float = 0.3):
+def is_ambiguous(size, equivalence: Equivalence):
     """Whether an instance looks (nearly) the same under both readings.
 
     Args:
       size: [..., K, 3] part sizes; a thin part against a thick one decides.
-      equivalence: the declared ambiguity.
-      tolerance: largest relative difference of any extent of exchanged parts.
+      equivalence: the declared ambiguity, with its tolerance.
 
     Returns:
       [...] bool.
@@ -89,4 +88,4 @@ def is_ambiguous(size, equivalence: Equivalence, tolerance: float = 0.3):
     turn = np.abs(np.asarray(equivalence.turn)).T
     other = (turn * size[..., list(equivalence.permutation), None, :]).sum(-1)
     difference = jnp.abs(other - size) / jnp.maximum(other, size)
-    return (difference <= tolerance).all((-1, -2))
+    return (difference <= equivalence.tolerance).all((-1, -2))
