@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from caper_jax.articulation.category import Category, Equivalence, Joint, ObjectModel
-from caper_jax.geometry.solids import Solid, box, cylinder
+from caper_jax.categories.forms import about
+from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid, frustum
 
 # Positive opens: the lid, in front of the hinge (+z), swings up (+y), which is about -x.
 _HINGE = np.array([[-1.0, 0.0, 0.0]])
-_TURN_X = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # cylinder z -> x
+_TURN_X = about("y", np.pi / 2)  # z -> x
+_UP, _DOWN = about("x", -np.pi / 2), about("x", np.pi / 2)  # z -> y and z -> -y
 
 
 def _pencil_case(rng: np.random.Generator) -> ObjectModel:
@@ -37,14 +39,24 @@ def _pencil_case(rng: np.random.Generator) -> ObjectModel:
         lid_length = min(lid_length, length - 1.2 * wall) if lid_bottom < height / 2 else lid_length
         hinge_y = height / 2 - height * rng.uniform(0.1, 0.45)
     hinge_z = -depth / 2 + depth * rng.uniform(0.0, 0.1)
+    # Soft cases are round at the front and the sides.
+    edge = scale * rng.uniform(0.004, 0.014) if rng.random() < 0.3 else 0.0
 
     # Cavity, open at the top. Most cases have an inlay: what shows is its upper side, often
     # halfway up.
     floor = wall if rng.random() < 0.3 else rng.uniform(0.2, 0.7) * height
     if not on_top:  # room for a lid let in
         floor = min(floor, max(wall, lid_bottom - 0.002 + height / 2))
-    base = [_tray((length, height, depth), wall, floor, upside_down=False)]
-    base += _contents(rng, (length, height, depth), wall, floor, lid_bottom)
+    size = (length, height, depth)
+    inset = wall + edge
+    if edge:
+        base = _soft_tray((0.0, 0.0, 0.0), size, edge, wall, floor, upside_down=False)
+    elif rng.random() < 0.2:
+        inset += _slope(rng, size)
+        base = [_tapered_tray(size, inset - wall, wall, floor)]
+    else:
+        base = [_tray(size, wall, floor, upside_down=False)]
+    base += _contents(rng, size, inset, floor, lid_bottom)
     if not on_top and rng.random() < 0.5:
         # The back wall with the hinge stays as high as the rim.
         base.append(
@@ -69,11 +81,15 @@ def _pencil_case(rng: np.random.Generator) -> ObjectModel:
                 (lid_length / 2, lid_thickness / 2, plate / 2),
             ),
         ]
+    elif edge and on_top:
+        lid_floor = max(0.25 * lid_thickness, 0.002)
+        lid_size = (lid_length, lid_thickness, lid_depth)
+        lid = _soft_tray(lid_center, lid_size, edge, wall, lid_floor, upside_down=True)
     else:
         lid = [_lid_shell(rng, lid_center, (lid_length, lid_thickness, lid_depth), wall)]
     if rng.random() < 0.5:
         lid.append(_clasp(rng, lid_center, (lid_length, lid_thickness, lid_depth), height))
-    if rng.random() < 0.3:
+    if not edge and rng.random() < 0.4:
         radius = min(0.5 * lid_thickness, scale * 0.006)
         half_length = length * rng.uniform(0.1, 0.45)
         base.append(cylinder((0, hinge_y, hinge_z), (radius, radius, half_length), _TURN_X))
@@ -87,15 +103,30 @@ def _chest(rng: np.random.Generator) -> ObjectModel:
     height = rng.uniform(0.04, 0.22)
     wall = rng.uniform(0.002, 0.009)
     floor = wall + (0.0 if rng.random() < 0.6 else rng.uniform(0.0, 0.6) * height)
-    base = [_tray((length, height, depth), wall, floor, upside_down=False)]
-    base += _contents(rng, (length, height, depth), wall, floor, height / 2)
+    size = (length, height, depth)
+    slope = _slope(rng, size) if rng.random() < 0.3 else 0.0
+    if slope:
+        base = [_tapered_tray(size, slope, wall, floor)]
+    else:
+        base = [_tray(size, wall, floor, upside_down=False)]
+    base += _contents(rng, size, wall + slope, floor, height / 2)
     thickness = rng.uniform(0.003, 0.012)
     hinge = (0.0, height / 2, -depth / 2)
     style = rng.random()
-    if style < 0.4:  # plate
+    if style < 0.3:  # plate, perhaps with a lip that goes into the base
         over = rng.uniform(-0.002, 0.012)
         size = (length + 2 * over, thickness, depth + over)
         lid = [box((0, height / 2 + thickness / 2, over / 2), np.array(size) / 2)]
+        if rng.random() < 0.3:
+            lip = min(rng.uniform(0.004, 0.015), 0.2 * height)
+            inner = (length / 2 - 1.5 * wall - 0.001, lip / 2, depth / 2 - 1.5 * wall - 0.002)
+            lid.append(box((0, height / 2 - lip / 2, 0.001), inner))
+    elif style < 0.42:  # a lid with sloping sides, as of gift boxes, trunks and caskets
+        rise = rng.uniform(0.1, 0.45) * min(depth, 2 * height)
+        half = (length / 2, depth / 2, rise / 2)
+        hole = box((0, height / 2, 0), (0.6 * half[0], rise * rng.uniform(0.3, 0.7), 0.6 * half[1]))
+        taper = rng.uniform(0.62, 0.95, 2)
+        lid = [frustum((0, height / 2 + rise / 2, 0), half, taper, _UP, hole=hole)]
     elif style < 0.75:  # a lid with a rim around the base
         rim = height * rng.uniform(0.1, 0.4)
         size = (length + 2 * wall + 0.002, rim + thickness, depth + wall + 0.001)
@@ -115,12 +146,24 @@ def _chest(rng: np.random.Generator) -> ObjectModel:
         ]
     if rng.random() < 0.4:
         lid.append(_clasp(rng, (0, height / 2, 0), (length, 2 * thickness, depth), height))
-    if rng.random() < 0.3:  # feet
-        foot = rng.uniform(0.004, 0.015)
+    elif rng.random() < 0.3:  # a knob to lift it by
+        knob = rng.uniform(0.005, 0.011)
+        lid.append(ellipsoid((0, height / 2 + knob, depth / 2 + 0.6 * knob), (knob, knob, knob)))
+    style = rng.random()
+    foot = rng.uniform(0.004, 0.015)
+    if style < 0.15:
         for side_x in (-1, 1):
             for side_z in (-1, 1):
-                place = (side_x * length * 0.4, -height / 2 - foot / 2, side_z * depth * 0.4)
-                base.append(box(place, (foot, foot / 2, foot)))
+                x, z = (
+                    side_x * (0.45 * length - foot - slope),
+                    side_z * (0.45 * depth - foot - slope),
+                )
+                place = (x, -height / 2 - foot / 2, z)
+                base.append(cylinder(place, (foot, foot, foot / 2), _UP))
+    elif style < 0.3:  # runners
+        for side_x in (-1, 1):
+            place = (side_x * (0.45 * length - foot - slope), -height / 2 - foot / 2, 0)
+            base.append(box(place, (foot, foot / 2, 0.45 * depth - slope)))
     high = np.radians(rng.uniform(95, 185))
     return _model(base, lid, hinge, (0.0, high))
 
@@ -132,6 +175,38 @@ def _tray(size, wall: float, floor: float, upside_down: bool, center=(0.0, 0.0, 
     cavity = np.asarray(center, float) + (0, sign * floor, 0)
     half = (length / 2 - wall, height / 2, depth / 2 - wall)
     return box(center, np.array(size) / 2, hole=box(cavity, half))
+
+
+def _soft_tray(
+    center, size, edge: float, wall: float, floor: float, upside_down: bool
+) -> list[Solid]:
+    """A tray whose front and sides bulge by ``edge`` metres, flat at the back."""
+    length, height, depth = size
+    middle = np.asarray(center, float)
+    inner = (length - 2 * edge, height, depth - edge)
+    solids = [_tray(inner, wall, floor, upside_down, middle - (0, 0, edge / 2))]
+    front = middle + (0, 0, depth / 2 - edge)
+    solids.append(cylinder(front, (edge, height / 2, length / 2 - edge), _TURN_X))
+    for side in (-1, 1):
+        end = (side * (length / 2 - edge), 0, 0)
+        flank = middle - (0, 0, edge / 2) + end
+        solids.append(cylinder(flank, (edge, height / 2, depth / 2 - edge / 2)))
+        solids.append(ellipsoid(front + end, (edge, height / 2, edge)))
+    return solids
+
+
+def _slope(rng: np.random.Generator, size) -> float:
+    """How far, in metres, the walls of a tapered tray come in towards its bottom."""
+    length, height, depth = size
+    return min(rng.uniform(0.03, 0.15) * height, 0.12 * min(length, depth))
+
+
+def _tapered_tray(size, slope: float, wall: float, floor: float) -> Solid:
+    """An open box that is narrower at the bottom; the cavity has upright walls."""
+    half = np.array([size[0], size[2], size[1]]) / 2
+    inner = half[:2] - slope - wall
+    hole = box((0, floor, 0), (inner[0], half[2], inner[1]))
+    return frustum((0, 0, 0), half, 1 - slope / half[:2], _DOWN, hole=hole)
 
 
 def _lid_shell(rng: np.random.Generator, center, size, wall: float) -> Solid:
@@ -158,15 +233,22 @@ def _contents(rng: np.random.Generator, size, wall: float, floor: float, top: fl
         else:
             place = (0, bottom + reach, rng.uniform(-0.3, 0.3) * depth)
             things.append(box(place, (length / 2 - wall, reach, 0.0012)))
-    for _ in range(rng.integers(0, 3)):
-        half = 0.5 * room * rng.uniform(0.2, 0.9)
-        x, z = rng.uniform(-0.25, 0.25) * length, rng.uniform(-0.25, 0.25) * depth
-        if rng.random() < 0.5:
-            half_x, half_z = rng.uniform(0.05, 0.2) * length, rng.uniform(0.05, 0.2) * depth
-            things.append(box((x, bottom + half, z), (half_x, half, half_z)))
+    inner = np.array([length, depth]) / 2 - wall
+    for _ in range(rng.integers(0, 3 if len(things) < 2 else 2)):
+        rise = 0.5 * room * rng.uniform(0.2, 0.9)
+        spot = rng.uniform(-0.25, 0.25, 2) * (length, depth)
+        lying = rng.random() < 0.5  # a pen or a tube
+        if lying:
+            rise = min(rise, 0.4 * inner[1])
+            half = np.array([length * rng.uniform(0.1, 0.22), rise])
         else:
-            half_length = length * rng.uniform(0.1, 0.22)
-            things.append(cylinder((x, bottom + half, z), (half, half, half_length), _TURN_X))
+            half = rng.uniform(0.05, 0.2, 2) * (length, depth)
+        half = np.minimum(half, 0.9 * inner)
+        x, z = np.clip(spot, half - inner, inner - half)
+        if lying:
+            things.append(cylinder((x, bottom + rise, z), (rise, rise, half[0]), _TURN_X))
+        else:
+            things.append(box((x, bottom + rise, z), (half[0], rise, half[1])))
     return things
 
 

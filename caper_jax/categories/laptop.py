@@ -5,16 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from caper_jax.articulation.category import Category, Equivalence, Joint, ObjectModel
-from caper_jax.geometry.solids import Solid, box, cylinder
+from caper_jax.categories.forms import about
+from caper_jax.geometry.solids import Solid, box, cylinder, frustum
 
 # Positive opens: the lid, above the hinge (+y) at rest, leans back (-z), which is about -x.
 _HINGE = np.array([[-1.0, 0.0, 0.0]])
-_TURN_X = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # cylinder z -> x
-
-
-def _tilt_x(angle: float) -> np.ndarray:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
+_TURN_X = about("y", np.pi / 2)  # z -> x
+_UPRIGHT = about("x", -np.pi / 2)  # z -> y
+_DOWN = about("x", np.pi / 2)  # z -> -y
 
 
 def _keyboard(rng: np.random.Generator, width: float, depth: float, top: float) -> list[Solid]:
@@ -36,23 +34,43 @@ def _keyboard(rng: np.random.Generator, width: float, depth: float, top: float) 
 
 
 def _base(rng: np.random.Generator, width: float, depth: float, thickness: float) -> list[Solid]:
-    """Slab, wedge or rounded slab, with keyboard and perhaps feet or a battery bulge."""
+    """The keyboard half: one of six bodies, with keyboard and perhaps feet or a battery bulge."""
     top = thickness / 2
     half = np.array([width, thickness, depth]) / 2
-    style = rng.random()
+    body = rng.choice(
+        ["slab", "corners", "undercut", "teardrop", "wedge", "rounded"],
+        p=[0.22, 0.23, 0.15, 0.12, 0.1, 0.18],
+    )
     recess: Solid | None = None
     keyboard: list[Solid] = []
-    if rng.random() < 0.65:
+    if rng.random() < 0.65 or body in ("undercut", "teardrop"):
         keyboard = _keyboard(rng, width, depth, top)
     elif rng.random() < 0.6:
         reach = rng.uniform(0.35, 0.5) * depth
         center = (0, top, -depth / 2 + 0.1 * depth + reach / 2)
         recess = box(center, (width * 0.44, min(0.003, 0.3 * thickness), reach / 2))
-    if style < 0.5:
+    if body == "slab":
         solids = [box((0, 0, 0), half, hole=recess)]
-    elif style < 0.75:  # wedge: the underside rises to the front
+    elif body == "corners":  # rounded at the front, seen from above
+        radius = rng.uniform(0.006, 0.022)
+        solids = [
+            box((0, 0, -radius / 2), half - (0, 0, radius / 2), hole=recess),
+            box((0, 0, half[2] - radius / 2), (half[0] - radius, half[1], radius / 2)),
+        ]
+        for side in (-1, 1):
+            corner = (side * (half[0] - radius), 0, half[2] - radius)
+            solids.append(cylinder(corner, (radius, radius, half[1]), _UPRIGHT))
+    elif body == "undercut":  # smaller at the bottom
+        taper = 1 - rng.uniform(0.5, 1.6) * thickness / np.array([width, depth])
+        solids = [frustum((0, 0, 0), (half[0], half[2], half[1]), taper, _DOWN)]
+    elif body == "teardrop":  # thin at the front, its top level: turned by half the angle
+        thin = rng.uniform(0.3, 0.7)
+        slope = np.arctan2(thickness * (1 - thin) / 2, depth)
+        raised = (0, thickness * (1 - thin) / 4, 0)
+        solids = [frustum(raised, half, (1.0, thin), about("x", -slope))]
+    elif body == "wedge":  # cut off from below towards the front
         rise = np.arctan2(thickness * rng.uniform(0.3, 0.6), depth)
-        cut = box((0, -thickness, depth * 0.1), (width, thickness / 2, depth), _tilt_x(-rise))
+        cut = box((0, -thickness, depth * 0.1), (width, thickness / 2, depth), about("x", -rise))
         solids = [box((0, 0, 0), half, hole=cut)]
     else:  # rounded front and sides
         radius = thickness / 2
@@ -61,8 +79,8 @@ def _base(rng: np.random.Generator, width: float, depth: float, thickness: float
         edge = (radius, radius, core[0])
         solids.append(cylinder((0, 0, half[2] - radius), edge, _TURN_X))
         for side in (-1, 1):
-            left = (side * core[0], 0, -radius / 2)
-            solids.append(cylinder(left, (radius, radius, half[2] - radius / 2)))
+            flank = (side * core[0], 0, -radius / 2)
+            solids.append(cylinder(flank, (radius, radius, half[2] - radius / 2)))
     solids += keyboard
     if rng.random() < 0.3:
         bulge = rng.uniform(0.003, 0.01)
@@ -71,20 +89,37 @@ def _base(rng: np.random.Generator, width: float, depth: float, thickness: float
     return solids
 
 
-def _lid(rng: np.random.Generator, width: float, height: float, thickness: float, hinge):
+def _lid(
+    rng: np.random.Generator, width: float, height: float, thickness: float, hinge
+) -> list[Solid]:
     """Plate above the hinge whose front (+z) is the screen, with a bezel or a logo bump."""
     center = np.array([hinge[0], hinge[1] + height / 2, hinge[2] - thickness / 2])
     half = np.array([width, height, thickness]) / 2
     screen: Solid | None = None
     if rng.random() < 0.75:
-        bezel = rng.uniform(0.004, 0.02)
+        bezel = rng.uniform(0.002, 0.02)
         chin = rng.uniform(0.006, 0.03)
         sunk = min(rng.uniform(0.0008, 0.003), 0.4 * thickness)
         screen = box(
             center + (0, (chin - bezel) / 2, thickness / 2),
             (half[0] - bezel, half[1] - (bezel + chin) / 2, sunk),
         )
-    solids = [box(center, half, hole=screen)]
+    style = rng.random()
+    if style < 0.4:  # rounded corners at the top
+        radius = rng.uniform(0.005, 0.02)
+        strip = center + (0, half[1] - radius / 2, 0)
+        solids = [
+            box(center - (0, radius / 2, 0), half - (0, radius / 2, 0), hole=screen),
+            box(strip, (half[0] - radius, radius / 2, half[2]), hole=screen),
+        ]
+        for side in (-1, 1):
+            corner = center + (side * (half[0] - radius), half[1] - radius, 0)
+            solids.append(cylinder(corner, (radius, radius, half[2])))
+    elif style < 0.7 and screen is None:  # thinner at the edges: the back is a flat pyramid
+        taper = 1 - rng.uniform(0.5, 3.0) * thickness / np.array([width, height])
+        solids = [frustum(center, half, taper, about("y", np.pi))]
+    else:
+        solids = [box(center, half, hole=screen)]
     if rng.random() < 0.2:
         solids.append(box(center - (0, 0, thickness / 2), (0.02, 0.02, 0.0008)))
     return solids
