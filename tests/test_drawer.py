@@ -165,5 +165,5 @@ def test_every_kind_of_cabinet_occurs(models):
 
 
 def test_instances_stay_cheap(models):
-    assert max(sum(map(len, model.parts)) for model in models) <= 45
+    assert max(sum(map(len, model.parts)) for model in models) <= 35
     assert np.mean([sum(map(len, model.parts)) for model in models]) < 26

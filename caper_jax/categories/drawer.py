@@ -59,7 +59,12 @@ def _style(rng: np.random.Generator, kind: str, plan: Plan) -> _Style:
         handle = rng.choice(styles, p=(0.08, 0.36, 0.0, 0.2, 0.2, 0.16, 0.0, 0.0))
     else:
         handle = rng.choice(styles, p=(0.08, 0.22, 0.18, 0.14, 0.14, 0.07, 0.1, 0.07))
-    rails = rng.random() < 0.15 and handle not in ("rod", "tag") and kind != "cart"
+    # What costs most solids does not come together.
+    cart = kind == "cart"
+    if cart and handle in ("rod", "tag"):
+        handle = "staple"
+    slender = handle not in ("rod", "tag") and relief not in ("panel", "bow")
+    rails = rng.random() < 0.2 and slender and not cart
     depth = plan.scale * rng.uniform(0.003, 0.012)
     if relief in ("shaker", "grip"):
         depth = min(depth, 0.7 * plan.front)
@@ -69,7 +74,7 @@ def _style(rng: np.random.Generator, kind: str, plan: Plan) -> _Style:
         relief=relief,
         rim=plan.scale * rng.uniform(0.02, 0.06),
         depth=depth,
-        handle=Handle.draw(rng, handle, plan.scale, plan.width > 0.45),
+        handle=Handle.draw(rng, handle, plan.scale, plan.width > 0.45 and not rails),
         # A label needs the room above its rod.
         handle_height=0.5 if handle == "tag" or rng.random() < 0.55 else rng.uniform(0.6, 0.82),
         grip=rng.uniform(0.08, 0.42),
@@ -78,7 +83,7 @@ def _style(rng: np.random.Generator, kind: str, plan: Plan) -> _Style:
         tray_depth=rng.uniform(0.78, 0.98),
         walls=plan.scale * rng.uniform(0.003, 0.014),
         rails=rails,
-        full=0.6 if rng.random() < 0.35 and not rails else 0.0,
+        full=0.6 if rng.random() < 0.4 and not (rails or cart) else 0.0,
     )
 
 
@@ -192,9 +197,9 @@ DRAWER = Category(
     ),
     mean_center=(
         (0.0, 0.0, -0.01),
-        (-0.001, -0.168, 0.031),
-        (-0.001, 0.059, 0.031),
-        (-0.001, 0.257, 0.031),
+        (-0.002, -0.168, 0.031),
+        (-0.002, 0.059, 0.031),
+        (-0.002, 0.257, 0.031),
     ),
     shape=shape,
 )
