@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import quick_jit
 
 from caper_jax import categories
 from caper_jax.data.synthetic import masks
@@ -33,7 +34,7 @@ BOX = categories.get("box")
 def over_keys(function):
     """The function's results for many keys, as numpy arrays."""
     keys = jax.random.split(jax.random.key(0), KEYS)
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(function))(keys))
+    return jax.tree.map(np.asarray, quick_jit(jax.vmap(function))(keys))
 
 
 def distance_to(pixels):
@@ -195,7 +196,16 @@ CLEAN = GeneratorConfig(instances=8, grid=48, num_points=512, noise=("none",))
 @pytest.fixture(scope="module")
 def plain():
     """Frames that nothing disturbs."""
-    return jax.tree.map(np.asarray, Generator(BOX, CLEAN).batch(jax.random.key(0), 24))
+    return draw(CLEAN)
+
+
+def draw(config):
+    """24 frames of boxes, as numpy arrays."""
+    generator = Generator(BOX, config)
+    batch = quick_jit(partial(generator.draw, batch_size=24))(
+        jax.random.key(0), bank=generator.bank
+    )
+    return jax.tree.map(np.asarray, batch)
 
 
 def outside_part(batch, points):
@@ -220,7 +230,7 @@ def test_everything_at_once_keeps_poses_and_labels_true(plain):
         dropout=0.1,
         holes=0.5,
     )
-    batch = jax.tree.map(np.asarray, Generator(BOX, config).batch(jax.random.key(0), 24))
+    batch = draw(config)
     jax.tree.map(np.testing.assert_array_equal, batch.pose, plain.pose)
     np.testing.assert_array_equal(batch.instance, plain.instance)
     own = batch.labels >= 0
@@ -235,7 +245,7 @@ def test_everything_at_once_keeps_poses_and_labels_true(plain):
 
 def test_depth_scale_moves_a_frame_and_residue_single_points(plain):
     config = dataclasses.replace(CLEAN, depth_scale=0.02, residue=0.2)
-    batch = jax.tree.map(np.asarray, Generator(BOX, config).batch(jax.random.key(0), 24))
+    batch = draw(config)
     ratio = np.linalg.norm(batch.points, axis=-1) / np.linalg.norm(plain.points, axis=-1)
     residue = batch.labels < 0
     assert 0.02 < residue.mean() < 0.2 and residue.mean(axis=1).max() < 0.3

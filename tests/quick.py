@@ -1,0 +1,9 @@
+"""Programs that run once: compiling without optimisation takes half the time."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+
+quick_jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
