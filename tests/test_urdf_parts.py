@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 
 import numpy as np
@@ -127,6 +128,18 @@ def test_broken_content_is_explained(old, new, message, tmp_path):
         read_urdf(path)
 
 
+def test_what_is_not_geometry_is_left_unread(tmp_path):
+    """Transmissions and the like are often incomplete; a hinge without limits turns for ever."""
+    path = two_part(tmp_path).write()
+    text = path.read_text().replace('type="revolute"', 'type="continuous"')
+    text = text.replace("</robot>", "<transmission><joint/></transmission></robot>")
+    path.write_text(text.replace('<robot name="thing">', "<robot>"))
+    model = read_urdf(path)
+    assert model.joints[0].limits == (-np.inf, np.inf)
+    item = bring(model, LAPTOP, ImportOptions())
+    np.testing.assert_allclose(item.states, [LAPTOP.joints[0].limits])
+
+
 def test_corrupted_mesh_is_named(tmp_path):
     path = two_part(tmp_path).write()
     (tmp_path / "meshes" / "lid_0.obj").write_text("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n")
@@ -211,6 +224,8 @@ def test_what_does_not_map_is_explained(tmp_path):
         map_parts(laptop, DRAWER)
     with pytest.raises(CaperError, match=r"6 revolute joint.s. in a chain, .*chain has 1 of them"):
         map_parts(laptop, ROBOTARM)
+    with pytest.raises(CaperError, match=r"revolute joints follow one another: joint1 .*joint2"):
+        map_parts(read_urdf(serial_arm(tmp_path / "c")), LAPTOP)
     robot = two_part(tmp_path / "b").link("other", LID)
     robot.joint("second", "revolute", "body", "other", xyz=(0, -0.1, 0.01), limits=(0, 1))
     double = read_urdf(robot.write())
@@ -283,6 +298,15 @@ def test_oblique_models_keep_their_hinge(tmp_path):
             getattr(turned.reference, field), getattr(straight.reference, field), atol=1e-9
         )
     assert "30 deg off the file's axes" in turned.notes[-2]
+
+
+def test_categories_without_a_rule_take_the_usual_frame(tmp_path):
+    """One's own category: at rest at 0, z up, x to the front, the sense of the file."""
+    category = dataclasses.replace(LAPTOP, name="hatch")
+    item = import_urdf(two_part(tmp_path).write(), category)
+    np.testing.assert_allclose(item.reference.axis, [[0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(item.reference.limits, [[-1.5, 1.0]])
+    np.testing.assert_allclose(item.size, [(0.2, 0.02, 0.3), (0.02, 0.2, 0.3)], atol=1e-9)
 
 
 def test_another_class_of_partnet_is_refused(tmp_path):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 
@@ -160,15 +161,22 @@ def _parse(path: Path) -> Any:
     if not path.is_file():
         raise CaperError(f"{path}: no such file")
     try:
-        tag = ElementTree.parse(path).getroot().tag
+        root = ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, UnicodeDecodeError, ValueError) as error:
         raise CaperError(f"{path}: not an XML file ({error})") from error
-    if tag != "robot":
-        raise CaperError(f"{path}: no URDF: its outermost element is <{tag}>, not <robot>")
+    if root.tag != "robot":
+        raise CaperError(f"{path}: no URDF: its outermost element is <{root.tag}>, not <robot>")
+    for child in list(root):
+        # What simulators and controllers add is often incomplete, and nothing to us.
+        if child.tag not in ("link", "joint"):
+            root.remove(child)
+    root.attrib.setdefault("name", path.stem)
+    content = BytesIO(ElementTree.tostring(root))
     try:
-        return URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+        return URDF.load(content, build_scene_graph=False, load_meshes=False).robot
     except (URDFError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise CaperError(f"{path}: malformed URDF ({error or type(error).__name__})") from error
+        # Missing attributes come as a KeyError with nothing but their name.
+        raise CaperError(f"{path}: malformed URDF ({error!r})") from error
 
 
 def _joint(path: Path, joint: Any) -> UrdfJoint:

@@ -104,19 +104,21 @@ def _star_joints(tree: LinkTree, category: Category) -> tuple[str, list[UrdfJoin
         ranked = sorted(
             (j for j in fitting if j.kind == kind), key=lambda j: tree.size[j.name], reverse=True
         )
-        apart: list[UrdfJoint] = []
+        first: list[UrdfJoint] = []
         for joint in ranked:
-            if not any(_nested(tree, joint, other) for other in apart):
-                apart.append(joint)
+            if not any(_nested(tree, joint, other) for other in first):
+                first.append(joint)
         count = wanted.count(kind)
-        hung, apart = _seat_of_root(tree, apart, count)
+        hung, apart = _seat_of_root(tree, first, count)
         root = hung or root
         if len(apart) < count:
             raise _misfit(tree, category, f"it has {len(apart)} {kind} joint(s) that fit", fitting)
-        if len(apart) > count and (
-            tree.size[apart[count].name] > _MINOR * tree.size[apart[count - 1].name]
-        ):
+        least = _MINOR * tree.size[apart[count - 1].name]
+        if len(apart) > count and tree.size[apart[count].name] > least:
             raise _misfit(tree, category, f"{len(apart)} {kind} joints fit alike", apart)
+        upon = [j for j in ranked if j not in first and tree.size[j.name] > least]
+        if upon:
+            raise _misfit(tree, category, f"{kind} joints follow one another", [*apart, *upon])
         chosen += apart[:count]
     return _root_by_name(tree, category, root, chosen), chosen
 

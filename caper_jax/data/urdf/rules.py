@@ -58,7 +58,7 @@ def _snap(state: float, limits: np.ndarray, degrees: float, quarter: bool = Fals
 
 
 def _opens(ref: Reference, joint: int) -> float:
-    """+1 or -1: the sign of the states on the open side of a closed joint.
+    """+1 or -1: the sign of the states to which a joint at the end of its range can go.
 
     The side on which more of its range lies; without a clear one, the side on which the object
     gets larger.
@@ -106,13 +106,12 @@ def _level(direction: np.ndarray) -> np.ndarray:
 def _perpendicular(ref: Reference) -> np.ndarray:
     """laptop: the lid's plate at 90 deg to the base's, on the side to which it opens."""
     opening = ref.turn(0, _level(ref.direction(0, 0)), ref.direction(1, 0))
-    low, high = ref.limits[0]
     if np.radians(10) < abs(opening) < np.radians(170):
         sense = np.sign(opening)
     elif abs(opening) <= np.radians(10):
         sense = _opens(ref, 0)
     else:  # modelled flat open: most of the range closes it
-        sense = 1.0 if high + low < 0 else -1.0
+        sense = -_opens(ref, 0)
         opening = sense * abs(opening)
     return np.array([_snap(sense * np.pi / 2 - opening, ref.limits[0], 6.0, quarter=True)])
 
