@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections import Counter
 from typing import Any
 
 import flax.struct
@@ -10,7 +11,7 @@ import numpy as np
 
 from caper_jax.articulation.category import Category, ObjectModel
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solids import TAPERED, Solid, bounds
+from caper_jax.geometry.solids import TAPERED, Kind, Solid, bounds
 
 # Splits never share an instance: each draws from its own family of seeds.
 SPLITS = {"train": 0, "val": 1, "test": 2}
@@ -18,27 +19,31 @@ SPLITS = {"train": 0, "val": 1, "test": 2}
 
 @flax.struct.dataclass
 class SolidGroup:
-    """All solids of one kind pair (e.g. box minus cylinder); M slots per instance.
+    """All solids of one kind (e.g. box minus cylinder); M slots per instance.
 
     Attributes:
       to_unit: [n, M, 3, 3] rest-canonical offsets -> unit solid.
       center: [n, M, 3] metres.
       half_axes: [n, M, 3, 3] columns are the solid's half axes (for its corners).
-      part: [n, M] int32.
       valid: [n, M] bool; unused slots are False.
       taper: [n, M, 2], or None for kinds that have none.
       hole_to_unit, hole_center, hole_taper: the same for the solid cut away, or None.
+      part: M indices in ascending order: each slot serves one part. Static, as are the next two.
+      kind: see ``Solid``.
+      hole: kind of the solid cut away, or None.
     """
 
     to_unit: Any
     center: Any
     half_axes: Any
-    part: Any
     valid: Any
-    taper: Any = None
-    hole_to_unit: Any = None
-    hole_center: Any = None
-    hole_taper: Any = None
+    taper: Any
+    hole_to_unit: Any
+    hole_center: Any
+    hole_taper: Any
+    part: tuple[int, ...] = flax.struct.field(pytree_node=False)
+    kind: Kind = flax.struct.field(pytree_node=False)
+    hole: Kind | None = flax.struct.field(pytree_node=False)
 
 
 @flax.struct.dataclass
@@ -95,28 +100,30 @@ def draw_models(category: Category, count: int, split: str, seed: int) -> list[O
 
 def build_bank(models: list[ObjectModel]) -> Bank:
     """Packs models (origins already centred) into one Bank of float32 numpy arrays."""
-    count = len(models)
-    solids = [
-        [(part, solid) for part, list_ in enumerate(model.parts) for solid in list_]
-        for model in models
-    ]
-    slots: dict[str, int] = {}
-    for rows in solids:
-        used: dict[str, int] = {}
-        for _, solid in rows:
-            name = _group_name(solid)
-            used[name] = used.get(name, 0) + 1
-        for name, number in used.items():
-            slots[name] = max(slots.get(name, 0), number)
-    # Never a single slot: XLA unrolls a loop of one turn into every use of its result, which costs
-    # more than ten further slots.
-    groups = {name: _empty_group(name, count, max(slots[name], 2)) for name in sorted(slots)}
-    for index, rows in enumerate(solids):
-        position = dict.fromkeys(slots, 0)
-        for part, solid in rows:
-            name = _group_name(solid)
-            _fill_slot(groups[name], index, position[name], part, solid)
-            position[name] += 1
+    kinds: dict[str, Solid] = {}
+    slots: Counter[tuple[str, int]] = Counter()  # of a kind and a part: the most of any instance
+    for model in models:
+        used: Counter[tuple[str, int]] = Counter()
+        for part, solids in enumerate(model.parts):
+            for solid in solids:
+                kinds.setdefault(_group_name(solid), solid)
+                used[_group_name(solid), part] += 1
+        slots |= used
+    groups, first = {}, {}
+    for name in sorted(kinds):
+        order = sorted(part for key, part in slots.elements() if key == name)
+        # Never a single slot: XLA merges a loop of one turn into what uses its result, where it
+        # costs more than a further slot.
+        order = order if len(order) > 1 else 2 * order
+        groups[name] = _empty_group(kinds[name], len(models), tuple(order))
+        first.update({(name, part): order.index(part) for part in set(order)})
+    for index, model in enumerate(models):
+        free = dict(first)
+        for part, solids in enumerate(model.parts):
+            for solid in solids:
+                name = _group_name(solid)
+                _fill_slot(groups[name], index, free[name, part], solid)
+                free[name, part] += 1
     boxes = np.array([[bounds(part) for part in model.parts] for model in models])
     return Bank(
         groups=groups,
@@ -128,29 +135,32 @@ def build_bank(models: list[ObjectModel]) -> Bank:
     )
 
 
-def _empty_group(name: str, count: int, slots: int) -> SolidGroup:
+def _empty_group(like: Solid, count: int, part: tuple[int, ...]) -> SolidGroup:
+    """Free slots, one for each entry of ``part``, for solids of the kind of ``like``."""
+    slots = len(part)
     eye = np.tile(np.eye(3, dtype=np.float32), (count, slots, 1, 1))
     zeros = np.zeros((count, slots, 3), np.float32)
-    kind, hole = name.split("-") if "-" in name else (name, None)
     ones = np.ones((count, slots, 2), np.float32)
+    hole = None if like.hole is None else like.hole.kind
     return SolidGroup(
         to_unit=eye.copy(),
         center=zeros.copy(),
         half_axes=np.zeros_like(eye),
-        part=np.zeros((count, slots), np.int32),
         valid=np.zeros((count, slots), bool),
-        taper=ones.copy() if kind in TAPERED else None,
+        taper=ones.copy() if like.kind in TAPERED else None,
         hole_to_unit=eye.copy() if hole else None,
         hole_center=zeros.copy() if hole else None,
         hole_taper=ones.copy() if hole in TAPERED else None,
+        part=part,
+        kind=like.kind,
+        hole=hole,
     )
 
 
-def _fill_slot(group: SolidGroup, index: int, slot: int, part: int, solid: Solid) -> None:
+def _fill_slot(group: SolidGroup, index: int, slot: int, solid: Solid) -> None:
     group.to_unit[index, slot] = solid.rotation.T / solid.half[:, None]
     group.center[index, slot] = solid.center
     group.half_axes[index, slot] = solid.rotation * solid.half
-    group.part[index, slot] = part
     group.valid[index, slot] = True
     if group.taper is not None:
         group.taper[index, slot] = solid.taper

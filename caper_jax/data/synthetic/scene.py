@@ -17,7 +17,7 @@ from caper_jax.data.synthetic import masks
 from caper_jax.data.synthetic import sensor as sensors
 from caper_jax.data.synthetic.bank import Bank, build_bank, draw_models
 from caper_jax.data.synthetic.camera import camera_pose, draw_camera
-from caper_jax.data.synthetic.caster import cast, projected_bounds
+from caper_jax.data.synthetic.caster import FAR, nearest_part, part_depths, projected_bounds
 from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.data.synthetic.surroundings import add_clutter, spill_on_table, table_depth
 
@@ -135,13 +135,13 @@ def observe(
     """
     rays = _ray_grid(keys.grid, instance, poses, config)
     flat = (rays[0].ravel(), rays[1].ravel())
-    depth, part = (image.reshape(rays[0].shape) for image in cast(instance.groups, poses, flat))
+    alone = part_depths(instance.groups, poses, flat)
+    depth, part = (image.reshape(rays[0].shape) for image in nearest_part(alone))
     depth, part, hit = _apply_mask(keys.mask, depth, part, instance, poses, rays, category, config)
     visible = jnp.stack([(hit & (part == k)).sum() for k in range(category.num_parts)])
     visibility = None
     if config.measure_visibility:
-        alone = _pixels_alone(instance, poses, flat, category.num_parts)
-        visibility = visible / jnp.maximum(alone, 1)
+        visibility = visible / jnp.maximum((alone < FAR).sum(axis=1), 1)
 
     sensor = sensors.draw(keys.sensor, mix)
     surface = sensors.surface(depth, hit, rays)
@@ -217,20 +217,6 @@ def _apply_mask(
             config.spill,
         )
     return depth, part, hit
-
-
-def _pixels_alone(instance: Bank, poses, rays, num_parts: int):
-    """[K] pixels of each part when all other parts are taken away."""
-
-    def pixels(k):
-        groups = {
-            name: replace(group, valid=group.valid & (group.part == k))
-            for name, group in instance.groups.items()
-        }
-        _, part = cast(groups, poses, rays)
-        return (part >= 0).sum()
-
-    return jax.lax.map(pixels, jnp.arange(num_parts))
 
 
 def _add_residue(key, points, labels, diagonal, largest: float):
