@@ -62,6 +62,15 @@ def test_meshes_are_found_scaled_and_placed(tmp_path):
     np.testing.assert_allclose(links["c"].bounds(), [[-0.5, -2, -2], [11, 2, 2]], atol=2e-3)
 
 
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".dae", ".glb", ".ply", ".off"])
+def test_every_format_of_meshes(suffix, tmp_path):
+    Robot(tmp_path).link("a", ((1, 2, 3), (0.1, 0.2, 0.3)), suffix=suffix).write()
+    mesh = read_urdf(tmp_path / "thing.urdf").links["a"]
+    expected = [[0.95, 1.9, 2.85], [1.05, 2.1, 3.15]]
+    np.testing.assert_allclose(mesh.bounds(), expected, rtol=1e-6)
+    assert mesh.moments()[0] == pytest.approx(2 * (0.02 + 0.03 + 0.06), rel=1e-5)
+
+
 def test_collada_unit_is_applied(tmp_path):
     pytest.importorskip("collada")
     Robot(tmp_path).link("a", ((0, 0, 0), (10, 20, 30)), suffix=".dae").write()

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds --urdf and what goes with it."""
     group = parser.add_argument_group(
         "objects from URDF files",
-        "How a file is understood is drawn to <out>_check/NAME.png and written to NAME.txt: look "
+        "How a file is understood is drawn to <out>_check/NAME.png and written to NAME.txt: look\n"
         "at them, and correct with these options what was not detected rightly.",
     )
     group.add_argument(
