@@ -41,7 +41,7 @@ class GeneratorConfig:
       dropout: largest fraction of lone pixels without depth; each frame draws its own.
       holes: rate of frames with 1 to 4 blobs without depth.
       depth_scale: standard deviation of the camera's relative error of all depths, one per frame.
-      measure_visibility: fill ``Batch.visibility``; costs one more ray cast per part.
+      measure_visibility: fill ``Batch.visibility``.
     """
 
     instances: int = 2000
