@@ -210,13 +210,27 @@ def _slide_frame(ref: Reference) -> Frame:
 
 
 def _cutter_frame(ref: Reference) -> Frame:
-    """cutter: x where the blade goes, y out of the flat face."""
+    """cutter: x where the blade goes, y out of the flat face, on the side of the slider.
+
+    The face is where the blade, with its slider, clearly stands out of the handle; of a cutter
+    without such a slider, the face across the handle's thin direction.
+    """
     travel = ref.axis[0] * _opens(ref, 0)
-    second = ref.parts[0].moments()[2]
-    across = np.eye(3) - np.outer(travel, travel)
-    vectors = np.linalg.eigh(across @ second @ across)[1]
-    # The travel itself has the value 0; the thin direction comes next.
-    up = _axis_near(vectors[:, 1])
+
+    def shift(direction: np.ndarray) -> float:
+        """Of the blade's middle from the handle's, as a share of the handle."""
+        handle, blade = (part.vertices @ direction for part in ref.parts)
+        apart = blade.max() + blade.min() - handle.max() - handle.min()
+        return float(apart / 2 / np.ptp(handle))
+
+    sides = [axis for axis in np.eye(3) if abs(axis @ travel) < 0.5]
+    up = max(sides, key=lambda direction: abs(shift(direction)))
+    if abs(shift(up)) < 0.24:
+        across = np.eye(3) - np.outer(travel, travel)
+        second = across @ ref.parts[0].moments()[2] @ across
+        # The travel itself has the value 0; the thin direction comes next.
+        up = np.linalg.eigh(second)[1][:, 1]
+    up = up * np.sign(shift(up)) if abs(shift(up)) > 0.05 else _axis_near(up)
     return up, np.cross(travel, up)
 
 
