@@ -214,7 +214,7 @@ def load(category: str, weights: str | Path | None = None) -> Estimator:
     """The estimator of a category.
 
     Args:
-      category: e.g. "box".
+      category: e.g. "box", or "FILE.py:NAME" (see ``categories.get``).
       weights: a model directory (weights.npz, model.json) as training writes it; by default the
         one that ships with the package.
 
@@ -228,16 +228,17 @@ def load(category: str, weights: str | Path | None = None) -> Estimator:
       prediction.pose.rotation         # [B, 2, 3, 3]
     """
     definition = categories.get(category)
-    directory = shipped_weights() / category if weights is None else Path(weights)
+    name = definition.name  # however it was spelled
+    directory = shipped_weights() / name if weights is None else Path(weights)
     if weights is None and not directory.is_dir():
         shipped = sorted(path.name for path in shipped_weights().glob("*/"))
         raise CaperError(
-            f"no weights for {category!r} ship with the package (there are some for "
+            f"no weights for {name!r} ship with the package (there are some for "
             f"{', '.join(shipped) or 'no category'}); train some and pass their folder as weights"
         )
     card, variables = read_model(directory)
-    if card.get("category") != category:
-        raise CaperError(f"{directory} holds a model of {card.get('category')!r}, not {category!r}")
+    if card.get("category") != name:
+        raise CaperError(f"{directory} holds a model of {card.get('category')!r}, not {name!r}")
     try:
         sizes = card["run"]["network"]
     except (KeyError, TypeError) as error:

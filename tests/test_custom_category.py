@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import microwave
 import numpy as np
 import pytest
+import tiny
 from frames import random_frames
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
 from caper_jax.cli.generate import main as generate
-from caper_jax.data import hdf5
+from caper_jax.configuration import to_dict
+from caper_jax.data import hdf5, open_dataset
 from caper_jax.data.synthetic.bank import build_bank, draw_models
+from caper_jax.data.synthetic.scene import GeneratorConfig
 from caper_jax.errors import CaperError
+from caper_jax.estimator import load
 from caper_jax.geometry.solids import bounds
+from caper_jax.model_files import write_model
+from caper_jax.training import run
+from caper_jax.training.task import Task
 
 FILE = Path(microwave.__file__)
 
@@ -53,6 +61,40 @@ def test_the_command_draws_frames_of_it(tmp_path):
         # The door turns against the body by the state, about the joint.
         turn = Rotation.from_rotvec(pose.joint_axis[0] * pose.joint_state[0]).as_matrix()
         np.testing.assert_allclose(pose.rotation[0].T @ pose.rotation[1], turn, atol=1e-5)
+
+
+def test_models_of_it_load_under_any_spelling(tmp_path, monkeypatch):
+    """Cards keep the category's own name, whatever the training was told."""
+    spelled = f"{FILE}:MICROWAVE"
+    config = run.RunConfig(spelled, tiny.network(), GeneratorConfig(num_points=64))
+    trained = []
+
+    def skip(fit_task, config, category):
+        trained.append((config, category, fit_task.keywords["description"]["category"]))
+        return SimpleNamespace(finished=False), None
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "_fit_generated", skip)
+        patch.setattr(Task, "init", lambda *_: {})
+        run.train(config, tmp_path)
+    (config, category, described), *_ = trained
+    assert config.category == described == category.name == "microwave"
+
+    card = {"category": config.category, "run": to_dict(config)}
+    write_model(tmp_path / "model", tiny.random_variables(category, config.network), card)
+    for name in (spelled, "microwave"):
+        assert load(name, tmp_path / "model").category is category
+    with pytest.raises(CaperError, match="a model of 'microwave', not 'box'"):
+        load("box", tmp_path / "model")
+    with pytest.raises(CaperError, match="no weights for 'microwave' ship"):
+        load(spelled)
+
+
+def test_datasets_open_under_any_spelling(tmp_path):
+    path = tmp_path / "frames.h5"
+    hdf5.write(path, category=microwave.MICROWAVE, split="test", **random_frames(3, 64))
+    spelled = f"{FILE}:MICROWAVE"
+    assert open_dataset("caper", path, spelled).category is categories.get(spelled)
 
 
 def test_from_python_the_object_is_enough():

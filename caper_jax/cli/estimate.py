@@ -48,7 +48,9 @@ def build_parser() -> argparse.ArgumentParser:
             ("--category box --points cloud.ply --json pose.json --picture pose.png", "keeps it"),
         ],
     )
-    parser.add_argument("--category", required=True, help="category of the object, e.g. box")
+    parser.add_argument(
+        "--category", required=True, help="e.g. box, or FILE.py:NAME for one of your own"
+    )
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument(
         "--depth", type=Path, help="16-bit PNG in millimetres, or float .npy [H, W] in metres"

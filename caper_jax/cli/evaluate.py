@@ -24,7 +24,9 @@ def build_parser() -> argparse.ArgumentParser:
             ("--category box --data box_test.h5 --format caper --out outputs/box", "generated"),
         ],
     )
-    parser.add_argument("--category", required=True, help="category of the objects, e.g. box")
+    parser.add_argument(
+        "--category", required=True, help="e.g. box, or FILE.py:NAME for one of your own"
+    )
     parser.add_argument("--data", required=True, type=Path, help="dataset's root folder or .h5")
     parser.add_argument("--format", required=True, help=f"layout of the data: {', '.join(FORMATS)}")
     parser.add_argument("--split", help="split to read (default: all there is)")

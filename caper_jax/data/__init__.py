@@ -34,7 +34,7 @@ def open_dataset(
       format: one of ``FORMATS``; "caper" is one HDF5 file of this project, the others are public
         layouts.
       root: the file or the root folder.
-      category: the category to read.
+      category: the category to read; its name, or FILE.py:NAME (see ``categories.get``).
       split: the split to read; None for all there is.
       official_split: tell train from test by the objects of the official split too (artimage,
         captra, pm-videos and reart-videos).
@@ -55,7 +55,7 @@ def open_dataset(
         options = {"num_points": num_points, "official_split": official_split}
     if official_split and format not in OFFICIAL_SPLITS:
         raise CaperError(f"format {format!r} has no official split ({', '.join(OFFICIAL_SPLITS)})")
-    dataset: Dataset = reader(root, category, split, **options)
+    dataset: Dataset = reader(root, categories.get(category).name, split, **options)
     return dataset
 
 

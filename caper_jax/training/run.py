@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ class RunConfig:
     """All that defines a run; the sections of a configuration file.
 
     Attributes:
-      category: name of a registered category.
+      category: its name, or FILE.py:NAME (see ``categories.get``).
       network: sizes.
       data: generated frames.
       loader: a dataset to train on instead of generated frames.
@@ -110,6 +110,7 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
       CaperError: see ``training.loop.fit``.
     """
     category = categories.get(config.category)
+    config = replace(config, category=category.name)  # FILE.py:NAME may be spelled in many ways
     task = Task(category, config.network, config.loss)
     description = to_dict(config)
     description.pop("training")
