@@ -28,6 +28,7 @@ from caper_jax.categories.laptop import LAPTOP
 from caper_jax.categories.robotarm import ROBOTARM
 from caper_jax.data.synthetic.bank import draw_models
 from caper_jax.data.urdf.canonical import ImportOptions, bring, import_urdf
+from caper_jax.data.urdf.export import write_urdf
 from caper_jax.data.urdf.load import UrdfJoint, UrdfModel, read_urdf
 from caper_jax.data.urdf.meshes import Mesh, join
 from caper_jax.data.urdf.parts import map_parts
@@ -217,3 +218,19 @@ def _centered(model):
     low = np.min([mesh.bounds[0] for mesh in meshes], axis=0)
     high = np.max([mesh.bounds[1] for mesh in meshes], axis=0)
     return model.pivot - (low + high) / 2
+
+
+@pytest.mark.parametrize("name", WITH_RULES)
+def test_exported_objects_come_back(name, tmp_path):
+    """Exported and imported: the same frame, joints and sizes."""
+    category = categories.get(name)
+    for index, model in enumerate(draw_models(category, 2, "test", 12)):
+        path = write_urdf(tmp_path / str(index), model, category, f"{name}{index}", sections=16)
+        item = import_urdf(path, category)
+        np.testing.assert_allclose(item.reference.axis, model.axis, atol=1e-5)
+        np.testing.assert_allclose(item.reference.limits, model.limits, atol=1e-5)
+        boxes = np.array([part_mesh(solids).bounds for solids in model.parts])
+        middle = (boxes[:, 0].min(0) + boxes[:, 1].max(0)) / 2
+        np.testing.assert_allclose(item.reference.pivot, model.pivot - middle, atol=1e-5)
+        np.testing.assert_allclose(item.size, np.ptp(boxes, axis=1), atol=1e-5)
+        np.testing.assert_allclose(item.box_center, boxes.mean(1) - middle, atol=1e-5)
