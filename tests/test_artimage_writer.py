@@ -18,7 +18,7 @@ from caper_jax.data.synthetic.bank import draw_models
 from caper_jax.data.synthetic.render import Image
 from caper_jax.data.synthetic.surface import surface_points
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solid_bounds import bounds
 
 SIZE = 64
 CAMERA = np.array([[91.4, 0.0, 31.5], [0.0, 90.0, 32.5], [0.0, 0.0, 1.0]])

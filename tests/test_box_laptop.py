@@ -11,7 +11,7 @@ from solid_points import inside, loose
 
 from caper_jax import categories
 from caper_jax.data.synthetic.bank import build_bank, draw_models
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solid_bounds import bounds
 
 # Length, height and depth of the base of the eight measured ReArt-48 boxes span these ranges, mm.
 MEASURED = ((201, 243), (24, 38), (74, 94))

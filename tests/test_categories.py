@@ -11,7 +11,7 @@ from caper_jax import categories
 from caper_jax.articulation.category import Category, Equivalence, Joint
 from caper_jax.data.synthetic.bank import draw_models
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solid_bounds import bounds
 
 NAMES = categories.names()
 INSTANCES = 300

@@ -22,7 +22,7 @@ from caper_jax.data.synthetic.bank import build_bank, draw_models
 from caper_jax.data.synthetic.scene import GeneratorConfig
 from caper_jax.errors import CaperError
 from caper_jax.estimator import load
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solid_bounds import bounds
 from caper_jax.model_files import write_model
 from caper_jax.training import run
 from caper_jax.training.task import Task

@@ -8,7 +8,7 @@ from solid_points import inside, loose
 
 from caper_jax import categories
 from caper_jax.data.synthetic.bank import draw_models
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solid_bounds import bounds
 
 # Length, height and width of the body, and length and width of the blade with its carrier, of the
 # nine measured ReArt-48 cutters, mm.

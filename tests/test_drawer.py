@@ -8,7 +8,7 @@ from solid_points import deepest_overlap, inside, loose
 
 from caper_jax.categories.drawer import DRAWER
 from caper_jax.data.synthetic.bank import draw_models
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solid_bounds import bounds
 
 CLOSE = 40  # instances of the tests that look at points
 

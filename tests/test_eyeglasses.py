@@ -9,7 +9,7 @@ from solid_points import deepest_overlap, inside, loose
 
 from caper_jax import categories
 from caper_jax.data.synthetic.bank import draw_models
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solid_bounds import bounds
 
 SIDES = (-1.0, 1.0)  # of the temples, parts 1 and 2
 

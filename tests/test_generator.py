@@ -19,7 +19,7 @@ from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.data.synthetic.render import render_image, write_frame
 from caper_jax.data.synthetic.scene import Generator, draw_state_and_poses
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solid_bounds import bounds
 
 NAMES = categories.names()
 CLEAN = GeneratorConfig(

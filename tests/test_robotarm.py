@@ -11,7 +11,7 @@ from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.categories import robotarm_chains as chains
 from caper_jax.categories.robotarm import _FAMILIES, ROBOTARM
 from caper_jax.data.synthetic.bank import draw_models
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solid_bounds import bounds
 
 HALF = np.pi / 2
 # Published Denavit-Hartenberg tables: (theta at zero, d, a, alpha), metres. Then the sign of each

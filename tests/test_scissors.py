@@ -13,7 +13,8 @@ from caper_jax import categories
 from caper_jax.articulation.equivalence import second_reading
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.synthetic.bank import build_bank, draw_models
-from caper_jax.geometry.solids import Solid, bounds
+from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import Solid
 
 REST = 20.0  # degrees between the blades
 HALF_TURN = np.diag([1.0, -1.0, -1.0])

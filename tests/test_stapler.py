@@ -9,7 +9,7 @@ from solid_points import inside, loose
 
 from caper_jax import categories
 from caper_jax.data.synthetic.bank import draw_models
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solid_bounds import bounds
 
 # Base length and width, height of the base with the hinge's cheeks, and height of the hinge over
 # the underside of the seven measured ReArt-48 staplers, mm.

@@ -20,7 +20,8 @@ from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.data.synthetic.bank import draw_models
 from caper_jax.data.urdf.export import part_mesh, write_urdf
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solids import bounds, box, cone, cylinder, ellipsoid, frustum
+from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import box, cone, cylinder, ellipsoid, frustum
 
 NAMES = ("laptop", "drawer", "robotarm")
 

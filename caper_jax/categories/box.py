@@ -279,8 +279,8 @@ BOX = Category(
     directions=("x", "z"),
     directions_reason="the hinge line and the way from hinge to front show at any opening angle",
     unit=7.0,
-    mean_size=((0.227, 0.063, 0.118), (0.226, 0.027, 0.118)),
-    mean_center=((0.0, -0.006, -0.002), (0.0, 0.024, 0.002)),
+    mean_size=((0.227, 0.062, 0.116), (0.224, 0.022, 0.117)),
+    mean_center=((0.0, -0.007, -0.003), (0.0, 0.026, 0.002)),
     shape=shape,
     equivalences=(
         Equivalence(

@@ -268,7 +268,7 @@ STAPLER = Category(
     directions=("y", "z"),
     directions_reason="mirror-symmetric in the y-z plane, so y and z are what the shape shows",
     unit=10.4,
-    mean_size=((0.04, 0.028, 0.176), (0.03, 0.034, 0.175)),
-    mean_center=((0.0, -0.008, -0.002), (0.0, 0.005, 0.0)),
+    mean_size=((0.04, 0.028, 0.176), (0.03, 0.031, 0.175)),
+    mean_center=((0.0, -0.008, -0.002), (0.0, 0.006, 0.0)),
     shape=shape,
 )

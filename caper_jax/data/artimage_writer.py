@@ -25,7 +25,7 @@ from caper_jax.data.public_urdf import ALIGNED, POINT_ORDER, RAW
 from caper_jax.data.synthetic.render import Image
 from caper_jax.data.synthetic.surface import surface_points
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solid_bounds import bounds
 
 SPLITS = ("train", "val", "test")
 _NUMBERS = {"laptop": 1, "eyeglasses": 2, "dishwasher": 3, "drawer": 4, "scissors": 5}

@@ -130,9 +130,3 @@ def _solid(kind: Kind, center, half, rotation, hole, taper=(1.0, 1.0)) -> Solid:
     if not (half > 0).all():
         raise CaperError(f"{kind}: half extents must be positive, got {half}")
     return Solid(kind, center, half, rotation, hole, taper)
-
-
-def bounds(solids: list[Solid]) -> tuple[np.ndarray, np.ndarray]:
-    """Axis-aligned bounds (low [3], high [3]) of a union of solids."""
-    low, high = zip(*(solid.extent() for solid in solids), strict=True)
-    return np.min(low, axis=0), np.max(high, axis=0)
