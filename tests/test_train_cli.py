@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def test_a_run_leaves_a_model_with_its_card(model):
     assert np.shape(card["mean_pose"]["rotation"]) == (3, 3)
     lines = [json.loads(line) for line in (model / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [5, 10]
-    assert lines[1]["loss"] < lines[0]["loss"]
+    assert all(math.isfinite(line["loss"]) and line["skipped"] == 0 for line in lines)
 
 
 def test_a_file_feeds_a_run_that_resumes_where_it_was(tmp_path, capsys):

@@ -30,14 +30,21 @@ from caper_jax.training.loop import FitResult, TrainingConfig, fit
 from caper_jax.training.task import LossConfig, Task
 
 _SAMPLE = 512  # frames that give the trivial predictor of the model card
-# Every sensor, some occlusion and residue: what a network must bear that has only seen generated
-# data when it meets a real camera.
+# Every sensor, and a little of everything that masks and cameras do wrong: what a network must bear
+# that has only seen generated data when it meets a real camera.
 TRAINING_DATA = GeneratorConfig(
     instances=4000,
     grid=64,
     noise=("none", "gauss3mm", "kinect", "realsense"),
     occlusion=0.1,
+    occluders=("edge", "strip", "blob"),
+    erosion=0.1,
+    table=0.1,
+    clutter=0.05,
+    spill=0.05,
     residue=0.01,
+    dropout=0.1,
+    holes=0.1,
 )
 
 
