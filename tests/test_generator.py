@@ -149,7 +149,11 @@ def test_cameras_keep_the_declared_ranges(clean):
     view = category.viewpoint
     eye = -np.einsum("bji,bj->bi", batch.pose.rotation[:, 0], batch.pose.translation[:, 0])
     distance = np.linalg.norm(eye, axis=-1)
-    elevation = np.degrees(np.arcsin(eye[:, "xyz".index(view.up)] / distance))
+    up = "xyz".index(view.up)
+    side = np.sign(eye[:, up]) if view.either_side else 1
+    assert not view.either_side or 0.2 < (side > 0).mean() < 0.8
+    elevation = np.degrees(np.arcsin(side * eye[:, up] / distance))
+    assert (side * batch.pose.rotation[:, 0, 1, up] < 0).all()  # what is up is up in the image
     # Exactly: the camera stands on a sphere around the origin, wherever it aims.
     assert elevation.min() > view.elevation[0] - 0.01
     assert elevation.max() < view.elevation[1] + 0.01

@@ -140,6 +140,14 @@ def test_the_table_touches_the_object_from_below():
     table = np.stack([x, y, np.ones_like(x)], -1) * depth[..., None]
     assert (depth < FAR).all() and (depth > 0).all()
     np.testing.assert_allclose(table @ up, np.min(lowest), atol=1e-5)
+    # Upside down the table touches it from the other side, where such objects may lie so.
+    either = dataclasses.replace(category.viewpoint, either_side=True)
+    over = np.diag([1.0, -1.0, -1.0, 1.0])
+    turned = (poses @ over).astype(np.float32)
+    for k in range(2):
+        instance.box_center[k] *= [1, -1, -1]
+    below = np.asarray(table_depth(instance, turned, either, RAYS))
+    np.testing.assert_allclose(below, depth, rtol=1e-5)
     # Rays along or above the horizon never meet it.
     assert np.asarray(table_depth(instance, poses, category.viewpoint, (0.0, -1.3))) == FAR
 

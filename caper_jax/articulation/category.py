@@ -76,6 +76,8 @@ class Viewpoint:
       elevation: degrees above the table.
       roll: degrees, symmetric about 0.
       distance: in object diagonals.
+      either_side: the object lies on its one side as often as on the other, so that cameras above
+        the table look at either.
     """
 
     up: Literal["x", "y", "z"] = "y"
@@ -83,6 +85,7 @@ class Viewpoint:
     elevation: tuple[float, float] = (5.0, 80.0)
     roll: float = 15.0
     distance: tuple[float, float] = (1.5, 6.0)
+    either_side: bool = False
 
 
 @dataclass(frozen=True)

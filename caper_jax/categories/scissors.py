@@ -219,8 +219,7 @@ SCISSORS = Category(
     mean_size=((0.164, 0.01, 0.06), (0.151, 0.01, 0.063)),
     mean_center=((0.0, 0.0, -0.016), (0.006, 0.0, 0.014)),
     shape=shape,
-    # They lie on either face, and are held.
-    viewpoint=Viewpoint(elevation=(-80.0, 80.0), roll=180.0),
+    viewpoint=Viewpoint(either_side=True),
     equivalences=(
         Equivalence(
             permutation=(1, 0),

@@ -25,6 +25,7 @@ class Camera:
       log_distance: natural logarithm of the distance in object diagonals.
       target: [3] the point aimed at, canonical frame, in object diagonals.
       aside: [2] where the target stands in the image, on the plane z = 1.
+      side: 1, or -1 where the object lies upside down: ``Viewpoint.up`` points into the table.
     """
 
     azimuth: Any
@@ -33,6 +34,7 @@ class Camera:
     log_distance: Any
     target: Any
     aside: Any
+    side: Any
 
 
 def draw_camera(key, view: Viewpoint) -> Camera:
@@ -47,6 +49,9 @@ def draw_camera(key, view: Viewpoint) -> Camera:
     # The object stands anywhere in the image. 0.55 and 0.35 are the half widths of a 58 x 39 deg
     # field of view at z = 1; wide cameras reach 1.2 times that.
     aside = (2.0 * uniform[7:9] - 1.0) * jnp.array([0.55, 0.35]) * 1.2 * uniform[9]
+    side = jnp.ones(())
+    if view.either_side:
+        side = jax.random.rademacher(jax.random.fold_in(key, 1), (), side.dtype)
     return Camera(
         azimuth=azimuth,
         elevation=elevation,
@@ -54,6 +59,7 @@ def draw_camera(key, view: Viewpoint) -> Camera:
         log_distance=nearest + uniform[3] * (farthest - nearest),
         target=(uniform[4:7] - 0.5) * 0.1,
         aside=aside,
+        side=side,
     )
 
 
@@ -97,6 +103,7 @@ def camera_arc(key, camera: Camera, view: Viewpoint, frames: int, speed) -> Came
         log_distance=path[3],
         target=jnp.broadcast_to(camera.target, (frames, 3)),
         aside=jnp.broadcast_to(camera.aside, (frames, 2)),
+        side=jnp.broadcast_to(camera.side, (frames,)),
     )
 
 
@@ -109,12 +116,12 @@ def camera_pose(camera: Camera, view: Viewpoint, diagonal):
       diagonal: of the object at rest, metres.
     """
     distance = diagonal * jnp.exp(camera.log_distance)
-    level, height = jnp.cos(camera.elevation), jnp.sin(camera.elevation)
+    level, height = jnp.cos(camera.elevation), camera.side * jnp.sin(camera.elevation)
     around = jnp.array([jnp.sin(camera.azimuth) * level, height, jnp.cos(camera.azimuth) * level])
     # Canonical axes (x, y, z) cycle so that `up` comes second.
     shift = {"y": 0, "z": 1, "x": -1}[view.up]
     eye = jnp.roll(around, shift) * distance
-    up = jnp.zeros(3).at["xyz".index(view.up)].set(1.0)
+    up = jnp.zeros(3).at["xyz".index(view.up)].set(camera.side)
     pose = _look_at(eye, camera.target * diagonal, up, camera.roll)
     # Turn the camera away from the object, keeping its place; less so at close range, where the
     # whole object must stay in front of it.

@@ -16,6 +16,8 @@ _FARTHEST_TABLE_M = 6.0
 def table_depth(instance: Bank, poses, view: Viewpoint, rays):
     """Depth of the table: the plane through the object's lowest point, across ``view.up``.
 
+    The camera is above the table; where the object lies upside down, it sees its underside.
+
     Args:
       instance: Bank without its leading axis; the boxes of its parts give the lowest point.
       poses: [K, 4, 4] part rest frame -> camera.
@@ -27,6 +29,8 @@ def table_depth(instance: Bank, poses, view: Viewpoint, rays):
     """
     x, y = rays
     normal = poses[0, :3, "xyz".index(view.up)]
+    if view.either_side:
+        normal *= jnp.where((normal * poses[0, :3, 3]).sum() < 0, 1.0, -1.0)
     # Elementwise products: exact in float32 on every backend.
     tilt = (normal[:, None] * poses[:, :3, :3]).sum(1)  # [K, 3] the normal in each part's frame
     height = (normal * poses[:, :3, 3]).sum(-1) + (tilt * instance.box_center).sum(-1)
