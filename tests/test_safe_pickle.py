@@ -4,6 +4,7 @@ import collections
 import os
 import pickle
 import struct
+import zipfile
 
 import numpy as np
 import pytest
@@ -121,3 +122,52 @@ def test_broken_and_missing_files(tmp_path):
         path.write_bytes(content)
         with pytest.raises(CaperError, match=r"a\.pkl: "):
             safe_pickle.load(path)
+
+
+def test_objects_in_npz_files(tmp_path):
+    """What numpy saves of a dictionary, alone or in an array."""
+    path = tmp_path / "a.npz"
+    several = np.empty((2, 1), object)
+    several[:, 0] = CONTENT, [np.eye(2)]
+    for save in (np.savez, np.savez_compressed):
+        save(path, one=CONTENT, several=several, plain=np.arange(3.0))
+        assert_same(safe_pickle.load_npz(path, "one"), CONTENT)
+        found = safe_pickle.load_npz(path, "several")
+        assert found.shape == (2, 1)
+        assert_same(found[0, 0], CONTENT)
+        assert_same(found[1, 0], [np.eye(2)])
+        assert_same(safe_pickle.load_npz(path, "plain"), np.arange(3.0))
+
+
+def test_npz_files_run_nothing(tmp_path):
+    trace, path = tmp_path / "it_ran", tmp_path / "bad.npz"
+    for content in (
+        Malicious(os.system, f"touch {trace}"),
+        {"depth": [np.array([Malicious(os.system, f"touch {trace}")])]},
+    ):
+        np.savez(path, all_dict=content)
+        with pytest.raises(CaperError, match=r"bad\.npz, 'all_dict': the pickle asks for .*system"):
+            safe_pickle.load_npz(path, "all_dict")
+    assert not trace.exists()
+
+
+def test_broken_npz_files(tmp_path):
+    path = tmp_path / "a.npz"
+    with pytest.raises(CaperError, match=r"a\.npz: no such file"):
+        safe_pickle.load_npz(path, "one")
+    np.savez(path, one={"a": 1})
+    with pytest.raises(CaperError, match=r"a\.npz: lacks 'two', it holds one"):
+        safe_pickle.load_npz(path, "two")
+    whole = path.read_bytes()
+    for content in (b"", whole[:-30], whole.replace(b"NUMPY", b"NAMPY")):
+        path.write_bytes(content)
+        with pytest.raises(CaperError, match=r"a\.npz, 'one': broken or no \.npz file"):
+            safe_pickle.load_npz(path, "one")
+    # A header that promises another array than the pickle holds.
+    np.savez(path, one=np.array([{"a": 1}], object))
+    with zipfile.ZipFile(path) as archive:
+        member = archive.read("one.npy")
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("one.npy", member.replace(b"(1,)", b"(2,)"))
+    with pytest.raises(CaperError, match=r"the pickle holds no array of shape \(2,\)"):
+        safe_pickle.load_npz(path, "one")

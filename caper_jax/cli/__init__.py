@@ -17,6 +17,7 @@ COMMANDS = {
     "generate": "write synthetic labelled data",
     "train": "train a category's networks, or resume a run",
     "evaluate": "measure a model on labelled data",
+    "validate": "check labelled data and list what is wrong with it",
     "gallery": "draw the generated shapes of the categories",
     "benchmark": "measure speed on this machine",
 }

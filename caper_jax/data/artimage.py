@@ -27,7 +27,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.data.artimage_models import RestModel, read_model
 from caper_jax.data.images import read_depth, read_intrinsics, read_json, read_labels
 from caper_jax.data.links import labelled_frame, ordered_links, pose_of_links
-from caper_jax.data.schema import Frame
+from caper_jax.data.schema import Frame, NoFramesError
 from caper_jax.errors import CaperError
 
 FORMAT = "artimage"
@@ -98,7 +98,7 @@ class ArtImageDataset:
         elif self.split != ALL:
             self._keep_listed(self._read_list())
         if not self._files:
-            raise CaperError(f"{self._home}: split {self.split!r} holds no frame")
+            raise NoFramesError(f"{self._home}: split {self.split!r} holds no frame")
         self.names: Sequence[str] = list(self._files)
 
     @classmethod

@@ -34,7 +34,7 @@ from caper_jax.data import safe_pickle
 from caper_jax.data.artimage_models import RestModel
 from caper_jax.data.captra_models import read_model
 from caper_jax.data.links import labelled_frame, pose_of_links
-from caper_jax.data.schema import Frame
+from caper_jax.data.schema import Frame, NoFramesError
 from caper_jax.errors import CaperError, unknown_name
 
 FORMAT = "captra"
@@ -113,7 +113,7 @@ class CaptraDataset:
         if official_split:
             self._keep_official()
         if not self._files:
-            raise CaperError(f"{self.root}: split {self.split!r} holds no {self.category.name}")
+            raise NoFramesError(f"{self.root}: split {self.split!r} holds no {self.category.name}")
         self.names: Sequence[str] = list(self._files)
 
     @staticmethod

@@ -32,7 +32,7 @@ from caper_jax.data.links import labelled_frame, ordered_links, polygon_labels, 
 from caper_jax.data.pm_videos import group_videos
 from caper_jax.data.public_urdf import ALIGNED, moving_joints
 from caper_jax.data.reartmix_models import CONVERSIONS, Model, read_model
-from caper_jax.data.schema import Frame
+from caper_jax.data.schema import Frame, NoFramesError
 from caper_jax.errors import CaperError, unknown_name
 
 FORMAT = "reart-videos"
@@ -101,7 +101,7 @@ class ReArtVideosDataset:
         self._select(official_split)
         self.names: Sequence[str] = list(self._files)
         if not self.names:
-            raise CaperError(f"{self._annotations}: split {self.split!r} holds no frame")
+            raise NoFramesError(f"{self._annotations}: split {self.split!r} holds no frame")
 
     @staticmethod
     def categories_in(root: Path) -> list[str]:

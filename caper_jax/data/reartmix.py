@@ -25,7 +25,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.data.images import read_depth, read_intrinsics, read_json
 from caper_jax.data.links import labelled_frame, ordered_links, polygon_labels, pose_of_links
 from caper_jax.data.reartmix_models import CONVERSIONS, Model, conversion_of, read_model
-from caper_jax.data.schema import Frame
+from caper_jax.data.schema import Frame, NoFramesError
 from caper_jax.errors import CaperError
 
 FORMAT = "reartmix"
@@ -185,7 +185,7 @@ class ReArtMixDataset:
             raise CaperError(f"{path}: names {unknown[0]!r}, which no annotation describes")
         names = [name for name in wanted or found if found[name]]
         if not names:
-            raise CaperError(
+            raise NoFramesError(
                 f"{self.root}: split {self.split!r} shows no instance of {self.category.name!r}"
             )
         return names

@@ -26,6 +26,10 @@ _ROTATION_TOLERANCE = 1e-3
 _MAX_DISTANCE_M = 50.0
 
 
+class NoFramesError(CaperError):
+    """A split that holds no frame of a category, in data that are otherwise well."""
+
+
 @dataclass(frozen=True)
 class Frame:
     """One object in one depth frame, in the camera's frame (OpenCV), metres.
