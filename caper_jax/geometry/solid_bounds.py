@@ -120,8 +120,9 @@ def _polytope(kind: str) -> tuple[np.ndarray, np.ndarray]:
     """Corners [n, 3] and edges [m, 2] of a unit solid before it is tapered; round ones are cut."""
     if kind in ("box", "frustum"):
         pairs = itertools.combinations(range(8), 2)
-        edges = [(a, b) for a, b in pairs if (_CORNERS[a] != _CORNERS[b]).sum() == 1]
-        return _CORNERS, np.array(edges)
+        return _CORNERS, np.array(
+            [(a, b) for a, b in pairs if (_CORNERS[a] != _CORNERS[b]).sum() == 1]
+        )
     if kind == "ellipsoid":
         return _sphere()
     index = np.arange(_SECTIONS)
