@@ -14,6 +14,7 @@ from caper_jax.articulation.category import ObjectModel
 from caper_jax.data.synthetic.bank import build_bank
 from caper_jax.data.synthetic.caster import FAR, cast, part_depths, projected_bounds
 from caper_jax.errors import CaperError
+from caper_jax.geometry.solid_bounds import bounds
 from caper_jax.geometry.solids import Solid, box, cone, cylinder, ellipsoid, frustum
 
 KINDS = ("box", "cylinder", "ellipsoid", "frustum", "cone")
@@ -38,10 +39,16 @@ def random_solid(rng: np.random.Generator, kind: str, center, scale: float, hole
 
 def random_pair(rng: np.random.Generator, kind: str, hole: str | None) -> Solid:
     """A solid of the first kind minus one of the second that leaves something of it."""
-    cut = None
-    if hole is not None:
+    if hole is None:
+        return random_solid(rng, kind, np.zeros(3), 0.1)
+    while True:
         cut = random_solid(rng, hole, rng.uniform(-0.07, 0.07, 3), 0.12)
-    return random_solid(rng, kind, np.zeros(3), 0.1, cut)
+        solid = random_solid(rng, kind, np.zeros(3), 0.1, cut)
+        try:
+            bounds([solid])
+        except CaperError:  # swallowed
+            continue
+        return solid
 
 
 class Scene:

@@ -34,7 +34,7 @@ def test_what_a_hole_leaves(kind, hole):
 
     rng = np.random.default_rng(KINDS.index(kind) * 5 + KINDS.index(hole))
     cut = 0
-    for _ in range(10):
+    for _ in range(6):
         solid = draw(rng, kind, 0.2, draw(rng, hole, 0.25))
         try:
             low, high = bounds([solid])
@@ -42,12 +42,12 @@ def test_what_a_hole_leaves(kind, hole):
             points = solid_points._surface(rng, dataclasses.replace(solid, hole=None), 2000)
             assert not solid_points.inside(solid, points, -1e-9).any()
             continue
-        mesh = part_mesh([solid], sections=256)
-        # Curved pieces are cut into 128 sections here, the mesh into 256: 1e-3 of 0.25 m.
-        tolerance = 1e-9 if {kind, hole} <= {"box", "frustum"} else 2.5e-4
+        mesh = part_mesh([solid], sections=96)
+        # Circles have 128 sections here and 96 in the mesh: 1e-3 of 0.25 m, twice.
+        tolerance = 1e-9 if {kind, hole} <= {"box", "frustum"} else 5e-4
         np.testing.assert_allclose([low, high], mesh.bounds, rtol=0, atol=tolerance)
         cut += not np.allclose([low, high], solid.extent(), rtol=0, atol=5e-3)
-    assert cut >= 3
+    assert cut >= 2
 
 
 def test_a_dome_reaches_down_to_its_cut():

@@ -39,7 +39,7 @@ def _remaining(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
         return low, high
     hit = [[_reached(solid, sign * axis) for axis in np.eye(3)] for sign in (-1, 1)]
     if not np.all(hit):
-        points = _corners_after_cut(solid)
+        points = corners_after_cut(solid)
         low = np.where(hit[0], low, points.min(axis=0))
         high = np.where(hit[1], high, points.max(axis=0))
     return low, high
@@ -64,8 +64,12 @@ def _reached(solid: Solid, direction: np.ndarray) -> bool:
     return bool((outermost @ normals.T - offsets > -_INSIDE * solid.hole.half.min()).any())
 
 
-def _corners_after_cut(solid: Solid) -> np.ndarray:
-    """[n, 3] corners of the pieces of a solid that its hole leaves."""
+def corners_after_cut(solid: Solid) -> np.ndarray:
+    """Corners [n, 3] (metres) of the pieces of a solid that its hole leaves.
+
+    Raises:
+      CaperError: the hole swallows the whole solid.
+    """
     unit, edges = _polytope(solid.kind)
     points = _points(solid, unit)
     assert solid.hole is not None

@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 
+from caper_jax.geometry.solid_bounds import corners_after_cut
 from caper_jax.geometry.solids import Solid
 
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -30,6 +31,15 @@ def surface_points(solids: list[Solid], count: int, rng: np.random.Generator) ->
         points = solid.center + (unit * solid.half) @ solid.rotation.T
         clouds.append(points if solid.hole is None else points[~_inside(solid.hole, points)])
     return np.concatenate([*clouds, *(_outermost(solid) for solid in solids)])
+
+
+def _outermost(solid: Solid) -> np.ndarray:
+    """The points of a solid, its hole cut away, that give its bounds."""
+    points = _extremes(solid)
+    if solid.hole is None:
+        return points
+    cut = _inside(solid.hole, points)
+    return np.concatenate([points[~cut], corners_after_cut(solid)]) if cut.any() else points
 
 
 def _random_unit(solid: Solid, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -73,8 +83,8 @@ def _inside(solid: Solid, points: np.ndarray) -> np.ndarray:
     return ((flat**2).sum(-1) < 1) & (np.abs(unit[:, 2]) < 1)
 
 
-def _outermost(solid: Solid) -> np.ndarray:
-    """Points of the solid that lie farthest along and against every coordinate axis."""
+def _extremes(solid: Solid) -> np.ndarray:
+    """Points of the solid without its hole, farthest along and against every coordinate axis."""
     if solid.kind in ("box", "frustum"):
         unit = _taper(solid, _CORNERS)
     else:
