@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import quick_jit
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 from scipy.spatial.transform import Rotation
@@ -27,9 +26,6 @@ KINDS = {
     "disjoint": (0.0, 0.0),
     "contained": (1e-12, 2e-6),
 }
-
-# For large functions that run once: half the time to compile.
-quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def pairs(kind: str, count: int = 30) -> tuple[np.ndarray, ...]:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yourdfpy
+from quick import quick_jit
 from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation import joints
@@ -24,10 +25,6 @@ TREES = {
     "tree": ("rrprpr", (0, 0, 1, 1, 3, 2)),
 }
 STATES = 6
-
-
-# For functions that run once: half the time to compile.
-quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def random_urdf(letters: str, parents: tuple[int, ...], g: np.random.Generator) -> str:
