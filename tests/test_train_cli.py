@@ -16,6 +16,7 @@ from caper_jax.configuration import update
 from caper_jax.model_files import read_model
 from caper_jax.training import run
 
+pytestmark = pytest.mark.xdist_group("train_cli")
 ROOT = Path(__file__).resolve().parents[1]
 # A batch that no eight devices can share: compiling for one is faster.
 TINY = ["--category", "box", "--config", str(ROOT / "configs" / "debug.toml")]
