@@ -130,6 +130,7 @@ class Hdf5Dataset:
 
     Attributes:
       category, format, split, mask_source, names: see ``Dataset``.
+      checked: every array was checked on opening; see ``Loader``.
       video, frame: [F] int32 number of the video and of the frame in it; None when the file holds
         single frames.
       instance: [F] int32 number of the object shown; None when unknown.
@@ -137,6 +138,7 @@ class Hdf5Dataset:
     """
 
     format = FORMAT
+    checked = True
 
     def __init__(self, path: str | Path, category: str | None = None, split: str | None = None):
         """Reads and checks the file.

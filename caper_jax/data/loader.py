@@ -195,7 +195,9 @@ def _ready(frame: Frame, dataset: Dataset) -> LabelledClouds | None:
     where = f"frame {frame.name!r} of {dataset.category.name}"
     if frame.truth is None:
         raise CaperError(f"{where} has no ground truth to train on")
-    problems = pose_problems(frame.truth, dataset.category)
+    # A file that was checked as a whole need not be checked again, frame by frame.
+    checked = getattr(dataset, "checked", False)
+    problems = [] if checked else pose_problems(frame.truth, dataset.category)
     if problems:
         raise CaperError(f"{where}: {'; '.join(problems)}")
     usable = np.isfinite(frame.points).all(-1)
