@@ -1,4 +1,4 @@
-"""``caper demo``: estimates on the real depth frames that ship with the package."""
+"""``caper demo``: estimates on the depth frames that ship with the package."""
 
 from __future__ import annotations
 
