@@ -130,13 +130,12 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
     fit_task = partial(
         fit, directory, config.training, task.loss, variables, mesh=mesh, description=description
     )
-    sample: Batch | LabelledClouds
     if config.loader is None:
-        result, sample = _fit_generated(fit_task, config, category)
+        result, draw_sample = _fit_generated(fit_task, config, category)
     else:
-        result, sample = _fit_dataset(fit_task, config, config.loader)
+        result, draw_sample = _fit_dataset(fit_task, config, config.loader)
     if result.finished and jax.process_index() == 0:
-        card = _card(config, result, sample)
+        card = _card(config, result, draw_sample())
         if started_from is not None:
             card["started_from"] = started_from
         write_model(directory, jax.device_get(result.state.variables), card)
@@ -145,8 +144,8 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
 
 def _fit_generated(
     fit_task: Callable[..., FitResult], config: RunConfig, category: Category
-) -> tuple[FitResult, Batch]:
-    """Trains on endless generated frames; also some of them."""
+) -> tuple[FitResult, Callable[[], Batch | LabelledClouds]]:
+    """Trains on endless generated frames; also a function that draws some of them."""
     generator = Generator(category, config.data, split="train", seed=config.training.seed)
     batch_size = config.training.batch_size
 
@@ -154,13 +153,13 @@ def _fit_generated(
         return generator.draw(key, batch_size, bank)
 
     result = fit_task(batch_fn=batch_fn, data=generator.bank)
-    return result, generator.batch(jax.random.key(config.training.seed), _SAMPLE)
+    return result, lambda: generator.batch(jax.random.key(config.training.seed), _SAMPLE)
 
 
 def _fit_dataset(
     fit_task: Callable[..., FitResult], config: RunConfig, source: LoaderConfig
-) -> tuple[FitResult, LabelledClouds]:
-    """Trains on a dataset; also some of its frames."""
+) -> tuple[FitResult, Callable[[], Batch | LabelledClouds]]:
+    """Trains on a dataset; also a function that reads some of its frames."""
     dataset = open_dataset(
         source.format,
         source.root,
@@ -178,8 +177,13 @@ def _fit_dataset(
         cache_gib=source.cache_gib,
     ) as loader:
         result = fit_task(batches=loader)
-    with Loader(dataset, min(_SAMPLE, len(dataset)), *arguments, process=(0, 1), prefetch=0) as one:
-        return result, one(0)
+
+    def draw_sample() -> LabelledClouds:
+        size = min(_SAMPLE, len(dataset))
+        with Loader(dataset, size, *arguments, process=(0, 1), prefetch=0) as once:
+            return once(0)
+
+    return result, draw_sample
 
 
 def _mesh(batch_size: int) -> jax.sharding.Mesh | None:
