@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from frames import TRUTH_FIELDS
 from PIL import Image
 
 from caper_jax import categories
@@ -57,18 +58,7 @@ def test_every_annotation_is_a_frame(root, name, dataset, truth):
         assert list(official.names) == list(listed.names)
 
 
-@pytest.mark.parametrize(
-    ("field", "key", "tolerance"),
-    [
-        ("rotation", "R", 1e-5),
-        ("translation", "t", 1e-5),
-        ("size", "size", 1e-4),
-        ("box_center", "box_centre", 1e-4),
-        ("joint_axis", "joint_axis", 1e-5),
-        ("joint_pivot", "joint_pivot", 1e-5),
-        ("joint_state", "joint_state", 1e-5),
-    ],
-)
+@pytest.mark.parametrize(("field", "key", "tolerance"), TRUTH_FIELDS)
 def test_ground_truth_agrees_with_an_independent_program(frames, truth, field, key, tolerance):
     expected = truth[key]
     if truth["joint_type"] == "revolute":

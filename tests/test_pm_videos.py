@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from frames import TRUTH_FIELDS
 
 from caper_jax.data import open_dataset
 from caper_jax.data.pm_videos import PmVideosDataset, group_videos
@@ -42,18 +43,7 @@ def test_every_frame_of_every_video(root, dataset, truth):
         assert list(test.names) == names
 
 
-@pytest.mark.parametrize(
-    ("field", "key", "tolerance"),
-    [
-        ("rotation", "R", 1e-5),
-        ("translation", "t", 1e-5),
-        ("size", "size", 1e-4),
-        ("box_center", "box_centre", 1e-4),
-        ("joint_axis", "joint_axis", 1e-5),
-        ("joint_pivot", "joint_pivot", 1e-5),
-        ("joint_state", "joint_state", 1e-5),
-    ],
-)
+@pytest.mark.parametrize(("field", "key", "tolerance"), TRUTH_FIELDS)
 def test_ground_truth_agrees_with_an_independent_program(frames, truth, field, key, tolerance):
     expected = truth[key]
     # The file's axis is the one about which the child turns by minus the state, in degrees.
