@@ -30,6 +30,7 @@ from caper_jax.networks.canonical import (
     view_rotation,
 )
 from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
+from caper_jax.networks.increment import increment_transform
 from caper_jax.networks.voting import vote
 
 # Part sizes are residuals to a mean; nothing else keeps a regression from going below zero.
@@ -90,16 +91,22 @@ def estimate(
         category.directions,
     )
 
-    canonical = canonicalise(cloud, rotation, root.translation)
-    parts = apply("parts", PartsNetwork(network, category.num_parts), canonical)
+    pose = se3.from_rt(rotation, root.translation)
+    parts_network = PartsNetwork(network, category.num_parts)
+    for _ in range(network.corrections):
+        canonical = canonicalise(cloud, pose[:, :3, :3], pose[:, :3, 3])
+        increment = apply("parts", parts_network, canonical).increment
+        pose = se3.compose(pose, increment_transform(increment, network.increment))
+    canonical = canonicalise(cloud, pose[:, :3, :3], pose[:, :3, 3])
+    parts = apply("parts", parts_network, canonical)
     axis, pivot = vote(canonical, parts.heatmap, parts.offset, parts.direction)
     length = jnp.array([1 / unit if kind == "prismatic" else 1.0 for kind in category.joint_types])
     state, pivot = parts.state * length, pivot / unit
 
     back = transpose(view)
-    translation = rotate(back, root.translation[:, None])[:, 0] / unit
+    translation = rotate(back, pose[:, None, :3, 3])[:, 0] / unit
     poses = forward_kinematics(
-        se3.from_rt(multiply(back, rotation), translation),
+        se3.from_rt(multiply(back, pose[:, :3, :3]), translation),
         axis,
         pivot,
         state,
@@ -107,7 +114,7 @@ def estimate(
         category.parents,
     )
     mean_size = jnp.asarray(category.mean_size)
-    pose = ArticulatedPose(
+    articulated = ArticulatedPose(
         rotation=poses[..., :3, :3],
         translation=poses[..., :3, 3],
         size=jnp.maximum(mean_size + parts.size / unit, _SMALLEST_SIZE * mean_size),
@@ -117,7 +124,7 @@ def estimate(
         joint_state=state,
     )
     labels = parts.segmentation.argmax(-1).astype(jnp.int32)
-    return Prediction(pose, points, labels, root.confidence, degenerate)
+    return Prediction(articulated, points, labels, root.confidence, degenerate)
 
 
 class Estimator:

@@ -57,7 +57,7 @@ def summarise(
         "frames": len(evaluation.names),
         "failures": int(evaluation.failed.sum()),
         "mask_source": dataset.mask_source,
-        **_tables(errors, category),
+        **error_tables(errors, category),
         "seconds_per_frame": evaluation.seconds_per_frame,
         "predictor": predictor,
         "weights": weights,
@@ -70,20 +70,21 @@ def summarise(
     if category.equivalences:
         report["up_to_symmetry"] = {
             "reasons": [equivalence.reason for equivalence in category.equivalences],
-            **_tables(pose_errors_up_to_symmetry(*arguments), category),
+            **error_tables(pose_errors_up_to_symmetry(*arguments), category),
         }
     return report
 
 
-def _tables(errors: PoseErrors, category: Category) -> dict[str, list[dict[str, Any]]]:
+def error_tables(errors: PoseErrors, category: Category) -> dict[str, list[dict[str, Any]]]:
+    """Mean and median of every error, per part and joint, JSON-ready."""
     parts = [
-        {"name": name, **{key: _summary(getattr(errors, key)[:, k]) for key in PART_METRICS}}
+        {"name": name, **{key: summary(getattr(errors, key)[:, k]) for key in PART_METRICS}}
         for k, name in enumerate(category.parts)
     ]
     joints = [
         {
             "type": kind,
-            **{key: _summary(getattr(errors, key)[:, j]) for key in JOINT_METRICS},
+            **{key: summary(getattr(errors, key)[:, j]) for key in JOINT_METRICS},
             "state_unit": _STATE_UNITS[kind],
         }
         for j, kind in enumerate(category.joint_types)
@@ -109,13 +110,13 @@ def _by_occlusion(
             chosen = inside[:, k]
             part: dict[str, Any] = {"name": name, "frames": int(chosen.sum())}
             if chosen.any():
-                part |= {key: _summary(getattr(errors, key)[chosen, k]) for key in PART_METRICS}
+                part |= {key: summary(getattr(errors, key)[chosen, k]) for key in PART_METRICS}
             parts.append(part)
         bins.append({"occluded": [low, high], "parts": parts})
     return bins
 
 
-def _summary(values: np.ndarray) -> dict[str, float | None]:
+def summary(values: np.ndarray) -> dict[str, float | None]:
     """Mean and median; None where the error has no meaning (pivots of prismatic joints)."""
     if np.isnan(values).all():
         return {"mean": None, "median": None}

@@ -1,4 +1,4 @@
-"""The two networks of CAPER++: root pose (Sec 5.1) and constrained parts (Sec 5.2)."""
+"""The two networks of CAPER++: root pose (Sec 5.1) and constrained parts (Sec 5.2, 5.3)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from caper_jax.networks.fast_encoder import FastEncoder, FastEncoderConfig
 from caper_jax.networks.heads import HeadConfig, PointHead, PooledHead, unit_vectors
 from caper_jax.networks.hs_encoder import HSEncoder, HSEncoderConfig
 
+IncrementKind = Literal["lie", "euclidean"]
+_INCREMENT_SIZE: dict[IncrementKind, int] = {"lie": 6, "euclidean": 9}
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -26,6 +29,10 @@ class NetworkConfig:
       root_heads: decoders of stage I.
       pooled_heads: decoders of stage II with one output per cloud (state, sizes).
       point_heads: decoders of stage II with one output per point (segmentation, joints).
+      increment: how stage II gives the root's pose increment (Sec 5.3.2): "lie", a twist of se(3)
+        (Eq 14), or "euclidean", two axes and a translation regressed as they are (Table 9).
+      corrections: how often the single-frame estimator corrects the root pose by that increment
+        before it reads the parts.
       num_points: points per cloud that the networks see.
       point_stride: in training the point-wise decoders see every so-manieth point only; they
         treat points alike, so this costs gradients, not coverage.
@@ -37,6 +44,8 @@ class NetworkConfig:
     root_heads: HeadConfig = HeadConfig()
     pooled_heads: HeadConfig = HeadConfig()
     point_heads: HeadConfig = HeadConfig()
+    increment: IncrementKind = "lie"
+    corrections: int = 1
     num_points: int = 1024
     point_stride: int = 1
 
@@ -89,7 +98,12 @@ class RootNetwork(nn.Module):
 class PartsOutput:
     """Stage II, in the root's canonical frame, network units; K parts, J = K - 1 joints.
 
+    The input is canonicalised by a reference pose (stage I's, or in tracking the keyframe's, which
+    makes it the proxy canonical space of Sec 5.3.1). ``increment`` says how far the root is from
+    that reference; everything else is said of the true canonical frame.
+
     Attributes:
+      increment: [B, 6] or [B, 9], see ``networks.increment``; zero where the reference is right.
       segmentation: [B, N, K] logits.
       heatmap: [B, N, J] in (0, 1), weight of each point's vote (Eq 5).
       offset: [B, N, J, 3] from the point to its foot on the joint axis (Eq 4, as a vector).
@@ -99,6 +113,7 @@ class PartsOutput:
       center: [B, K, 3] residual to the category's mean box centre.
     """
 
+    increment: Any
     segmentation: Any
     heatmap: Any
     offset: Any
@@ -109,7 +124,7 @@ class PartsOutput:
 
 
 class PartsNetwork(nn.Module):
-    """Stage II: joint parameters by voting, joint states, part sizes and segmentation.
+    """Stage II: root increment, joint parameters by voting, joint states, sizes, segmentation.
 
     Attributes:
       config: sizes.
@@ -136,9 +151,12 @@ class PartsNetwork(nn.Module):
         votes = votes.reshape(batch, -1, joints, 7)
         pooled = self.config.pooled_heads
         state = PooledHead(joints, pooled, name="state")(features, train)
+        numbers = _INCREMENT_SIZE[self.config.increment]
+        increment = PooledHead(numbers, pooled, name="increment")(features, train)
         extent = PooledHead(6 * parts, pooled, name="size")(features, train)
         extent = extent.reshape(batch, parts, 6)
         return PartsOutput(
+            increment=increment,
             segmentation=segmentation,
             heatmap=jax.nn.sigmoid(votes[..., 0]),
             offset=votes[..., 1:4],

@@ -169,9 +169,12 @@ def segmentation_loss(logits, labels):
 
 
 def twist_loss(twist, true_twist):
-    """Eq 21: L1 of the se(3) coordinates (w, rho), [B, 6] -> [B] (mean over each half, summed)."""
+    """Eq 21: L1 of the se(3) coordinates (w, rho), [B, 6] -> [B] (mean over each half, summed).
+
+    Also for increments in Euclidean coordinates, [B, 9]: two axes, then the translation.
+    """
     error = jnp.abs(twist - true_twist)
-    return error[..., :3].mean(-1) + error[..., 3:].mean(-1)
+    return error[..., :-3].mean(-1) + error[..., -3:].mean(-1)
 
 
 def weighted_total(weights: LossWeights, losses: dict[str, jax.Array]):

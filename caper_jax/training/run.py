@@ -27,6 +27,7 @@ from caper_jax.networks.caper import NetworkConfig
 from caper_jax.networks.presets import PRESETS as NETWORKS
 from caper_jax.training import parallel
 from caper_jax.training.loop import FitResult, TrainingConfig, fit
+from caper_jax.training.losses import LossWeights
 from caper_jax.training.task import LossConfig, Task
 
 _SAMPLE = 512  # frames that give the trivial predictor of the model card
@@ -91,8 +92,8 @@ def preset(name: str, category: str) -> RunConfig:
         category,
         NETWORKS[name],
         # exp(-D) is nearly constant inside the gate; a penalty of 20 drowns every other loss
-        # where states near zero are common.
-        loss=LossConfig(heatmap="linear", state_penalty=1.0),
+        # where states near zero are common. Increments weigh as much as absolute rotations.
+        loss=LossConfig(heatmap="linear", state_penalty=1.0, weights=LossWeights(twist=8.0)),
         training=TrainingConfig(
             optimizer="adamw",
             learning_rate=2e-3,

@@ -12,10 +12,11 @@ import numpy as np
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.equivalence import is_ambiguous, second_labels, second_reading
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.geometry import so3
+from caper_jax.geometry import se3, so3
 from caper_jax.geometry.directions import rotation_from_directions
 from caper_jax.networks.canonical import canonicalise, multiply, rotate, view_rotation
 from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
+from caper_jax.networks.increment import increment_numbers, increment_transform
 from caper_jax.networks.voting import vote
 from caper_jax.training import losses
 from caper_jax.training.losses import HeatmapKind, LossWeights
@@ -31,7 +32,9 @@ class LossConfig:
       state_penalty: alpha of Eq 20.
       root_noise_deg: stage II sees clouds canonicalised with a root pose that is off by a rotation
         with this standard deviation about each axis...
-      root_noise: ... and a translation with this standard deviation, in network units.
+      root_noise: ... and a translation with this standard deviation, in network units...
+      root_noise_spread: ... both times a factor drawn log-uniformly, per sample, between this
+        and one over this: errors of keyframes and of motion between frames, small and large.
       predicted_root: fraction of samples canonicalised with stage I's own (detached) prediction,
         where that is within 25 deg of the truth.
     """
@@ -41,6 +44,7 @@ class LossConfig:
     state_penalty: float = 20.0
     root_noise_deg: float = 4.0
     root_noise: float = 0.03
+    root_noise_spread: float = 4.0
     predicted_root: float = 0.5
 
 
@@ -95,13 +99,16 @@ class Task:
         output, root_state = self._apply("root", params, model_state, points, keys[0])
         truth, labels, root_losses = self._choose_reading(batch, view, output)
 
-        rotation, translation = self._noisy_root(keys[1], output, truth)
-        canonical = canonicalise(points, rotation, translation)
+        reference = self._noisy_root(keys[1], output, truth)
+        canonical = canonicalise(points, reference[:, :3, :3], reference[:, :3, 3])
         parts, parts_state = self._apply("parts", params, model_state, canonical, keys[2])
         stride = self.network.point_stride
         parts_losses, metrics = self._parts_losses(
             canonical[:, ::stride], parts, truth, labels[:, ::stride]
         )
+        increment_loss, off = self._increment_loss(parts.increment, reference, truth)
+        parts_losses["twist"] = increment_loss
+        metrics["increment_deg"] = off
 
         weights = self.config.weights
         total = losses.weighted_total(weights, root_losses).mean()
@@ -184,12 +191,15 @@ class Task:
         return rotation
 
     def _noisy_root(self, key, output, truth: ArticulatedPose):
-        """Root poses for canonicalisation: the truth with noise, or stage I's own prediction."""
+        """[B, 4, 4] reference poses: the truth with noise, or stage I's own prediction."""
         config = self.config
-        keys = jax.random.split(key, 3)
+        keys = jax.random.split(key, 4)
         batch = truth.translation.shape[0]
-        twist = jax.random.normal(keys[0], (batch, 3)) * np.radians(config.root_noise_deg)
-        shift = jax.random.normal(keys[1], (batch, 3)) * config.root_noise
+        spread = np.log(config.root_noise_spread)
+        factor = jnp.exp(jax.random.uniform(keys[3], (batch, 1), minval=-spread, maxval=spread))
+        sigma = factor * np.radians(config.root_noise_deg)
+        twist = jax.random.normal(keys[0], (batch, 3)) * sigma
+        shift = jax.random.normal(keys[1], (batch, 3)) * factor * config.root_noise
         rotation = multiply(truth.rotation[:, 0], so3.exp(twist))
         translation = truth.translation[:, 0] + shift
         predicted = jax.lax.stop_gradient(self._root_rotation(output))
@@ -198,7 +208,21 @@ class Task:
         own &= off < np.radians(25.0)
         rotation = jnp.where(own[:, None, None], predicted, rotation)
         guess = jax.lax.stop_gradient(output.translation)
-        return rotation, jnp.where(own[:, None], guess, translation)
+        return se3.from_rt(rotation, jnp.where(own[:, None], guess, translation))
+
+    def _increment_loss(self, numbers, reference, truth: ArticulatedPose):
+        """Eq 21 for the increment from the reference to the true root pose (Eq 10).
+
+        Returns:
+          (loss [B], mean angle in degrees between the corrected and the true rotation).
+        """
+        kind = self.network.increment
+        true_root = se3.from_rt(truth.rotation[:, 0], truth.translation[:, 0])
+        increment = se3.compose(se3.inverse(reference), true_root)
+        loss = losses.twist_loss(numbers, increment_numbers(increment, kind))
+        corrected = se3.compose(reference, increment_transform(numbers, kind))
+        off = so3.geodesic_distance(corrected[:, :3, :3], true_root[:, :3, :3])
+        return loss, jnp.degrees(jax.lax.stop_gradient(off)).mean()
 
     def _parts_losses(self, points, output, truth: ArticulatedPose, labels):
         """Losses of stage II, and metrics for people."""

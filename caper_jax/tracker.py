@@ -1,0 +1,156 @@
+"""Streaming tracker: a category's trained model, a pure jitted step, and what feeds it."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from caper_jax.data.cloud import MIN_POINTS, sample_points
+from caper_jax.errors import CaperError
+from caper_jax.estimator import Estimator, load
+from caper_jax.tracking.config import TrackerConfig
+from caper_jax.tracking.state import Observation, TrackerState
+from caper_jax.tracking.step import Tracked, given_state, initial_state, track_step
+
+
+class Tracker:
+    """Tracks one object through a stream of clouds.
+
+    The model is the single-frame estimator's: its stage II, shown a cloud canonicalised by a
+    keyframe's pose, gives the increment from there.
+
+    Attributes:
+      estimator: the trained model.
+      config: settings.
+      state: TrackerState after the last frame.
+      step: ``(variables, state, observation) -> (state, result)``, pure and jitted; for scans,
+        vmaps and gradients see ``tracking.step.track_step``.
+
+    Example:
+      tracker = load_tracker("laptop")
+      for points in clouds:          # [N, 3] metres, camera frame; N may vary, and be 0
+          result = tracker(points)
+          result.pose.rotation, result.lost
+    """
+
+    def __init__(self, estimator: Estimator, config: TrackerConfig | None = None) -> None:
+        self.estimator = estimator
+        self.config = config or TrackerConfig()
+        static: dict[str, Any] = {
+            "category": estimator.category,
+            "network": estimator.network,
+            "config": self.config,
+        }
+        self.function = partial(track_step, **static)
+        self.step = jax.jit(self.function)
+        self._given = jax.jit(partial(given_state, **static))
+        self._scan = jax.jit(self._through)
+        self.state = self.initial_state()
+
+    def initial_state(self) -> TrackerState:
+        """The state before a first frame, whose pose the static estimator will give."""
+        category, network = self.estimator.category, self.estimator.network
+        return initial_state(category, network, self.config)
+
+    def reset(self, points=None, rotation=None, translation=None, labels=None) -> None:
+        """Forgets the video; optionally begins another one with a known pose.
+
+        Args:
+          points: [N, 3] metres, the frame whose pose is known; None to let the estimator begin.
+          rotation: [K, 3, 3] part frame -> camera in that frame.
+          translation: [K, 3] metres.
+          labels: [N] int, parts of the points, where they are known.
+
+        Raises:
+          CaperError: too few usable points, or poses of other shapes.
+        """
+        self.state = self.initial_state()
+        if points is None:
+            return
+        frame = self.observe(points, labels)
+        if not frame.present:
+            raise CaperError(
+                f"the first frame shows too few points to begin with; at least {MIN_POINTS} are "
+                "needed"
+            )
+        parts = self.estimator.category.num_parts
+        rotation, translation = (
+            np.asarray(rotation, np.float32),
+            np.asarray(translation, np.float32),
+        )
+        if rotation.shape != (parts, 3, 3) or translation.shape != (parts, 3):
+            raise CaperError(
+                f"the first pose must be rotation [{parts}, 3, 3] and translation [{parts}, 3], "
+                f"got {list(rotation.shape)} and {list(translation.shape)}"
+            )
+        self.state = self._given(self.estimator.variables, frame, rotation, translation)
+
+    def observe(self, points, labels=None) -> Observation:
+        """A frame of any number of points as the step takes it.
+
+        Args:
+          points: [N, 3] metres, camera frame, N may be 0; NaN, infinite and zero points are left
+            out. Fewer than 16 usable points count as a frame that does not show the object.
+          labels: [N] int parts, -1 where unknown; by default all are predicted.
+
+        Raises:
+          CaperError: wrong shape or dtype, or points in millimetres.
+        """
+        count = self.estimator.network.num_points
+        points = np.asarray(points)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise CaperError(f"points must be [N, 3], got shape {points.shape}")
+        unknown = np.full(count, -1, np.int32)
+        usable = np.isfinite(points).all(1) & (points != 0).any(1)
+        if usable.sum() < MIN_POINTS:
+            nothing = np.zeros((count, 3), np.float32)
+            return Observation(nothing, np.asarray(False), unknown)
+        cloud = sample_points(points, count)
+        if labels is None:
+            return Observation(cloud.points, np.asarray(True), unknown)
+        labels = np.asarray(labels, np.int32)
+        if labels.shape != (len(points),):
+            raise CaperError(f"labels must be [{len(points)}] like points, got {labels.shape}")
+        return Observation(cloud.points, np.asarray(True), labels[cloud.index])
+
+    def __call__(self, points, labels=None) -> Tracked:
+        """Tracks through the next frame; see ``observe`` for the arguments."""
+        observation = self.observe(points, labels)
+        self.state, result = self.step(self.estimator.variables, self.state, observation)
+        return result
+
+    def track(self, observations: Observation, state: TrackerState | None = None) -> Tracked:
+        """Tracks through a recording in one compiled scan; ``self.state`` stays as it is.
+
+        Args:
+          observations: with a leading axis of T frames.
+          state: where to begin; by default before the first frame.
+
+        Returns:
+          Tracked with a leading axis of T.
+        """
+        begin = self.initial_state() if state is None else state
+        return self._scan(self.estimator.variables, begin, observations)[1]
+
+    def _through(self, variables, state: TrackerState, observations: Observation):
+        return jax.lax.scan(partial(self.function, variables), state, observations)
+
+
+def load_tracker(
+    category: str, weights: str | Path | None = None, config: TrackerConfig | None = None
+) -> Tracker:
+    """The tracker of a category, with the weights that ``load`` takes.
+
+    Args:
+      category: e.g. "box", or "FILE.py:NAME".
+      weights: a model directory; by default the one in the package.
+      config: settings.
+
+    Raises:
+      CaperError: see ``estimator.load``.
+    """
+    return Tracker(load(category, weights), config)

@@ -1,0 +1,289 @@
+"""Registration of a cloud to a keyframe's surface, on the kinematic tree.
+
+Beyond the paper: its network says in one pass how far the object moved since the keyframe, and is
+right to a degree or two; the two clouds together say it to a tenth of that. The keyframe's cloud
+becomes a few Gaussians (local mean and covariance, so that its noise averages out and its normals
+need no search), every point of the new cloud is matched with the nearest one of its part, and
+Gauss-Newton steps on the root's twist and the joint states minimise the robust Mahalanobis
+distances. All of it is differentiable but the choice of matches.
+
+Lengths are network units; a joint's state is radians or network units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from caper_jax.articulation.joints import joint_transforms
+from caper_jax.geometry import linalg, se3
+from caper_jax.networks.graph import gather, squared_distances
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    """How a cloud is registered; lengths in network units (objects are about 2 across).
+
+    Attributes:
+      steps: Gauss-Newton steps per frame, each with new matches; 0 leaves the network's increment.
+      gaussians: number of Gaussians of a keyframe.
+      window: standard deviation of the window around each of them.
+      noise: standard deviation added to their covariance: sensor and shape.
+      robust: Mahalanobis distance at which a match counts a quarter.
+      wrong_part: distance that a match across two parts must be closer by: labels may be wrong.
+      share: weight of a match; below one, as neighbouring points repeat each other.
+      root_rotation, root_translation, joint: standard deviations of what the prediction misses:
+        radians, units, radians or units.
+      network_rotation, network_translation, network_joint: likewise, of the network's answer.
+      hold: how far a root must seem to move before it moves, as a squared Mahalanobis distance:
+        one that stands still then does not tremble, or drift where little of it is in view.
+    """
+
+    steps: int = 3
+    gaussians: int = 256
+    window: float = 0.08
+    noise: float = 0.01
+    robust: float = 3.0
+    wrong_part: float = 0.1
+    share: float = 0.25
+    root_rotation: float = 0.1
+    root_translation: float = 0.1
+    joint: float = 0.2
+    network_rotation: float = 0.05
+    network_translation: float = 0.05
+    network_joint: float = 0.05
+    hold: float = 30.0
+
+
+@flax.struct.dataclass
+class Surface:
+    """Gaussians of a keyframe's cloud, in its proxy canonical space (Eq 9).
+
+    Attributes:
+      mean: [M, 3].
+      information: [M, 3, 3] inverse covariances.
+      labels: [M] int32 part of each.
+    """
+
+    mean: Any
+    information: Any
+    labels: Any
+
+
+@flax.struct.dataclass
+class Tree:
+    """The joints of an object, in the root's canonical frame.
+
+    Attributes:
+      axis: [J, 3] unit vectors.
+      pivot: [J, 3].
+      types, parents: static, see ``forward_kinematics``.
+    """
+
+    axis: Any
+    pivot: Any
+    types: tuple[str, ...] = flax.struct.field(pytree_node=False)
+    parents: tuple[int, ...] = flax.struct.field(pytree_node=False)
+
+
+def make_surface(points, labels, config: RegistrationConfig) -> Surface:
+    """The Gaussians of a cloud.
+
+    Args:
+      points: [N, 3] proxy canonical space.
+      labels: [N] int32.
+      config: sizes.
+    """
+    stride = max(1, points.shape[0] // config.gaussians)
+    centers, kinds = points[::stride][: config.gaussians], labels[::stride][: config.gaussians]
+    squared = squared_distances(centers[None], points[None])[0]
+    weight = jnp.exp(-0.5 * squared / config.window**2) * (kinds[:, None] == labels)
+    x, y, z = points.T
+    moments = jnp.stack([x, y, z, x * x, x * y, x * z, y * y, y * z, z * z], -1)
+    moments = jnp.matmul(weight, moments, precision="highest")
+    moments /= jnp.maximum(weight.sum(-1, keepdims=True), 1e-6)
+    mean = moments[:, :3]
+    second = moments[:, 3:][:, np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])]
+    covariance = second - mean[:, :, None] * mean[:, None, :]
+    covariance += config.noise**2 * jnp.eye(3, dtype=points.dtype)
+    return Surface(mean, _inverse(covariance), kinds)
+
+
+def part_motions(tree: Tree, before, after):
+    """[K, 4, 4] motion of every part in the root's frame, between two joint states [J]."""
+    old = part_poses(tree, before)
+    new = part_poses(tree, after)
+    return se3.compose(new, se3.inverse(old))
+
+
+def register(
+    surface: Surface,
+    surface_state,
+    tree: Tree,
+    points,
+    labels,
+    start,
+    expected,
+    config: RegistrationConfig,
+):
+    """Root pose and joint states at which a cloud lies on the keyframe's surface.
+
+    Args:
+      surface: of the keyframe.
+      surface_state: [J] joint states in it.
+      tree: joints.
+      points: [N, 3] camera frame.
+      labels: [N] int32 parts.
+      start: (root pose [4, 4], joint states [J]) where the search starts.
+      expected: pairs of such a pose with its standard deviations [6 + J]; what the result is
+        drawn to, and all that decides about what nothing in view determines.
+      config: steps and weights.
+
+    Returns:
+      (root [4, 4], state [J], information [6 + J, 6 + J] of (twist, states) in the last step).
+    """
+    root, state = start
+    joints = state.shape[0]
+    information = jnp.zeros((6 + joints, 6 + joints))
+    for _ in range(config.steps):
+        residual, jacobian, weight, matrix = _linearise(
+            surface, surface_state, tree, points, labels, root, state, config
+        )
+        weighted = jnp.einsum("nab,nbd->nad", matrix, jacobian, precision="highest")
+        weighted *= weight[:, None, None]
+        flat = weighted.reshape(-1, 6 + joints)
+        information = jnp.matmul(flat.T, jacobian.reshape(flat.shape), precision="highest")
+        gradient = jnp.matmul(flat.T, residual.reshape(-1), precision="highest")
+        total = information
+        for (there, there_state), sigma in expected:
+            away = se3.log(se3.compose(se3.inverse(there), root))
+            prior = 1.0 / jnp.square(sigma)
+            gradient += prior * jnp.concatenate([away, state - there_state])
+            total += jnp.diag(prior)
+        step = -jnp.linalg.solve(total, gradient)
+        root = se3.compose(root, se3.exp(step[:6]))
+        state = state + step[6:]
+    return root, state, information
+
+
+def hold_still(before, root, information, threshold: float):
+    """A root pose drawn back to the one before, as far as the motion is within its uncertainty.
+
+    The positive-part James-Stein estimate of the motion: zero up to the threshold, all of it far
+    beyond.
+
+    Args:
+      before: [4, 4] root pose of the last frame.
+      root: [4, 4] of this frame.
+      information: [6 + J, 6 + J] from ``register``; joint states are marginalised out.
+      threshold: squared Mahalanobis distance.
+    """
+    xi = se3.log(se3.compose(se3.inverse(before), root))
+    joint = information[6:, 6:] + 1e-3 * jnp.eye(information.shape[0] - 6, dtype=xi.dtype)
+    cross = information[:6, 6:]
+    marginal = information[:6, :6] - cross @ jnp.linalg.solve(joint, cross.T)
+    squared = xi @ marginal @ xi
+    moved = squared > threshold
+    share = jnp.where(moved, 1.0 - threshold / jnp.where(moved, squared, 1.0), 0.0)
+    return se3.compose(before, se3.exp(share * xi))
+
+
+def mismatch(
+    surface: Surface, surface_state, tree: Tree, points, labels, pose, config: RegistrationConfig
+):
+    """Mean robust distance [] of a cloud from the keyframe's surface, in [0, 1]: 1 is no match.
+
+    Args as for ``register``; ``pose`` is (root [4, 4], joint states [J]).
+    """
+    root, state = pose
+    residual, matrix, _, _ = _residuals(
+        surface, surface_state, tree, points, labels, root, state, config
+    )
+    squared = (residual * linalg.apply(matrix, residual)).sum(-1)
+    ratio = squared / config.robust**2
+    return (ratio / (1.0 + ratio)).mean()
+
+
+def _residuals(surface, surface_state, tree, points, labels, root, state, config):
+    """(residual [N, 3], information [N, 3, 3], points [N, 3], all in the root's frame; matches)."""
+    motions = part_motions(tree, surface_state, state)
+    here = se3.act(se3.inverse(root), points)
+    mean = se3.act(motions[surface.labels], surface.mean[:, None])[:, 0]
+    squared = squared_distances(here[None], mean[None])[0]
+    squared += jnp.where(labels[:, None] == surface.labels, 0.0, config.wrong_part**2)
+    at = jax.lax.stop_gradient(squared).argmin(-1)
+    turn = motions[surface.labels[at]][:, :3, :3]
+    matrix = linalg.multiply(
+        linalg.multiply(turn, gather(surface.information[None], at[None])[0]),
+        linalg.transpose(turn),
+    )
+    residual = here - gather(mean[None], at[None])[0]
+    return residual, matrix, here, at
+
+
+def _linearise(surface, surface_state, tree, points, labels, root, state, config):
+    """Residuals [N, 3], their Jacobian [N, 3, 6 + J], robust weights [N], information."""
+    residual, matrix, here, at = _residuals(
+        surface, surface_state, tree, points, labels, root, state, config
+    )
+    squared = (residual * linalg.apply(matrix, residual)).sum(-1)
+    weight = config.share / (1.0 + squared / config.robust**2) ** 2
+    # root -> root exp(xi) moves a point in the root's frame by -(w x p + rho).
+    zero = jnp.zeros_like(here[:, 0])
+    x, y, z = here.T
+    turn = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+    columns = [turn, -jnp.broadcast_to(jnp.eye(3, dtype=here.dtype), turn.shape)]
+    axis, pivot = _moved_joints(tree, state)
+    carried = jnp.asarray(_carried(tree.parents), here.dtype)
+    target = here - residual
+    for joint, kind in enumerate(tree.types):
+        if kind == "revolute":
+            motion = linalg.cross(
+                jnp.broadcast_to(axis[joint], target.shape), target - pivot[joint]
+            )
+        else:
+            motion = jnp.broadcast_to(axis[joint], target.shape)
+        moves = carried[joint][surface.labels[at]]
+        columns.append(-(motion * moves[:, None])[..., None])
+    return residual, jnp.concatenate(columns, -1), weight, matrix
+
+
+def part_poses(tree: Tree, state):
+    """[K, 4, 4] poses of the parts in the root's frame."""
+    moves = joint_transforms(tree.types, tree.axis, tree.pivot, state)
+    poses = [jnp.eye(4, dtype=moves.dtype)]
+    for joint, parent in enumerate(tree.parents):
+        poses.append(se3.compose(poses[parent], moves[joint]))
+    return jnp.stack(poses)
+
+
+def _moved_joints(tree: Tree, state):
+    """Axes and pivots [J, 3] where the joints stand at a state, in the root's frame."""
+    poses = part_poses(tree, state)[np.array(tree.parents, int)]
+    axis = linalg.apply(poses[:, :3, :3], tree.axis)
+    return axis, linalg.apply(poses[:, :3, :3], tree.pivot) + poses[:, :3, 3]
+
+
+def _carried(parents: Sequence[int]) -> np.ndarray:
+    """[J, K] float: whether joint j moves part k."""
+    joints = len(parents)
+    carried = np.zeros((joints, joints + 1), np.float32)
+    for child in range(1, joints + 1):
+        part = child
+        while part:
+            carried[part - 1, child] = 1.0
+            part = parents[part - 1]
+    return carried
+
+
+def _inverse(matrix):
+    """Inverse [..., 3, 3] of symmetric positive matrices, by cofactors."""
+    a, b, c = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
+    cofactors = jnp.stack([linalg.cross(b, c), linalg.cross(c, a), linalg.cross(a, b)], -1)
+    return cofactors / linalg.dot(a, cofactors[..., 0])[..., None, None]

@@ -1,0 +1,96 @@
+"""What a tracker remembers and what it is given: fixed-size pytrees."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+
+from caper_jax.tracking.registration import Surface
+
+
+@flax.struct.dataclass
+class Observation:
+    """One frame of a stream.
+
+    Attributes:
+      points: [N, 3] metres, camera frame; anything where ``present`` is false.
+      present: [] bool, whether the frame shows the object at all.
+      labels: [N] int32 part of each point where it is known, -1 where the tracker is to predict it.
+    """
+
+    points: Any
+    present: Any
+    labels: Any
+
+
+@flax.struct.dataclass
+class Constants:
+    """What stays the same throughout a video; network units, root's canonical frame.
+
+    Attributes:
+      axis, pivot: [J, 3] of the joints.
+      size, center: [K, 3] of the parts' boxes.
+      seen: [] float, frames in these means.
+      known: [J] float, how many frames' worth is known of each joint from a given first pose.
+    """
+
+    axis: Any
+    pivot: Any
+    size: Any
+    center: Any
+    seen: Any
+    known: Any
+
+
+@flax.struct.dataclass
+class Keyframe:
+    """The frame that increments refer to, tau(t) in Sec 5.3.2; network units.
+
+    Attributes:
+      root: [4, 4] root pose, proxy canonical space -> camera.
+      joint_state: [J].
+      parts: [K, 4, 4] pose of each part in the root's frame.
+      points: [N, 3] its cloud in its proxy canonical space (Eq 9).
+      labels: [N] int32 parts of the points.
+      surface: the same cloud, for registration.
+      age: [] int32, frames since.
+    """
+
+    root: Any
+    joint_state: Any
+    parts: Any
+    points: Any
+    labels: Any
+    surface: Surface
+    age: Any
+
+
+@flax.struct.dataclass
+class TrackerState:
+    """All a tracker remembers of a video; network units, camera frame.
+
+    Attributes:
+      root: [4, 4] root pose in the last frame.
+      joint_state: [J].
+      parts: [K, 4, 4] pose of each part in the root's frame.
+      root_velocity: [6] twist from frame to frame, in the root's frame.
+      joint_velocity: [J].
+      constants: what does not change in a video, as the mean over the frames so far.
+      variance: [3] of root rotation, root translation and joint states, as far as they have
+        drifted from what the static estimator or the user gave.
+      keyframe: what increments refer to.
+      doubtful: [] int32, frames in a row that disagreed with the track.
+      lost: [] bool, the next frame with points starts afresh from the static estimator.
+    """
+
+    root: Any
+    joint_state: Any
+    parts: Any
+    root_velocity: Any
+    joint_velocity: Any
+    constants: Constants
+    variance: Any
+    keyframe: Keyframe
+    doubtful: Any
+    lost: Any
