@@ -75,12 +75,13 @@ def _check_range(path: str | Path, median: float, integer: bool, scale: float | 
     raise CaperError(f"{path}: median depth would be {median:.3g} m; {advice}")
 
 
-def read_mask(path: str | Path) -> np.ndarray:
+def read_mask(path: str | Path, allow_empty: bool = False) -> np.ndarray:
     """Reads the mask of one object: everything that is not black.
 
     Args:
       path: grayscale, palette or colour image (transparent pixels are outside), or ``.npy``. In a
         JPEG, whose black is not quite black, values above 127 count.
+      allow_empty: take a mask without a pixel, of a frame that does not show the object.
 
     Returns:
       [H, W] bool, true on the object.
@@ -98,7 +99,7 @@ def read_mask(path: str | Path) -> np.ndarray:
         mask = np.any(raw > threshold, axis=-1)
     else:
         mask = np.any(raw[..., :-1] > threshold, axis=-1) & (raw[..., -1] > 0)
-    if not mask.any():
+    if not mask.any() and not allow_empty:
         raise CaperError(f"{path}: the mask is empty (all black); no object to estimate")
     return mask
 
