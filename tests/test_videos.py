@@ -90,6 +90,15 @@ def test_hard_videos_reverse_and_move_twice_as_fast(batches):
     assert ratio == pytest.approx(2.0, rel=0.1)
 
 
+def test_nothing_but_the_noise_moves_in_still_videos(batches):
+    generator, batch = batches["still"]
+    for array in (batch.pose.rotation, batch.pose.translation, batch.pose.joint_state):
+        np.testing.assert_array_equal(array, np.broadcast_to(array[:, :1], array.shape))
+    state = shares(generator, batch)
+    assert state.min() >= 0 and state.max() <= 1 and np.ptp(state[:, 0]) > 0.2
+    assert (batch.points[:, 1:] == batch.points[:, :-1]).all(axis=-1).mean() < 0.01
+
+
 def test_kinematics_labels_and_instance_hold_in_every_frame(batches):
     for _, batch in batches.values():
         pose = batch.pose

@@ -20,6 +20,7 @@ COMMANDS = {
     "validate": "check labelled data and list what is wrong with it",
     "gallery": "draw the generated shapes of the categories",
     "benchmark": "measure speed on this machine",
+    "reproduce": "measure the tables of the paper again",
 }
 
 EXAMPLES = """\

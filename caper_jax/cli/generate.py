@@ -55,8 +55,9 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--mode",
-        help="of the videos: paper (static camera, every joint opens), cam (the camera moves too) "
-        "or hard (it moves twice as fast, and the joints reverse) (default: paper)",
+        help="of the videos: paper (static camera, every joint opens), cam (the camera moves too), "
+        "hard (it moves twice as fast, and the joints reverse) or still (nothing moves) "
+        "(default: paper)",
     )
     parser.add_argument(
         "--frames-per-video", type=common.positive_int, metavar="T", help="(default: 30)"

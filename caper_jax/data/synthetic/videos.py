@@ -1,6 +1,7 @@
 """Endless labelled videos: one instance whose joints, and perhaps the camera, move.
 
-The protocol of PM-Videos (paper Sec. 6.1.1) and two harder ones; every frame is drawn by ``scene``.
+The protocol of PM-Videos (paper Sec. 6.1.1), two harder ones, and one in which nothing moves; every
+frame is drawn by ``scene``.
 """
 
 from __future__ import annotations
@@ -29,16 +30,19 @@ class Mode:
     Attributes:
       camera_speed: of the camera's arc, see ``camera.camera_arc``; 0 for a static camera.
       reverses: whether the joints turn round in the middle of the clip and go back.
+      still: whether the joints stay where they are.
     """
 
     camera_speed: float
     reverses: bool
+    still: bool = False
 
 
 MODES = {
     "paper": Mode(camera_speed=0.0, reverses=False),
     "cam": Mode(camera_speed=1.0, reverses=False),
     "hard": Mode(camera_speed=2.0, reverses=True),
+    "still": Mode(camera_speed=0.0, reverses=False, still=True),
 }
 
 
@@ -62,7 +66,8 @@ def video(
       category: its category.
       config: what the frames look like.
       mode: of ``MODES``: "paper" static camera, "cam" a camera on a smooth arc, "hard" twice its
-        speed and joints that reverse.
+        speed and joints that reverse, "still" nothing moves (each joint anywhere on the way that
+        it would go in "paper").
       frames: T.
 
     Returns:
@@ -75,22 +80,30 @@ def video(
 
 
 def _motion(mode: str, frames: int):
-    """The traced arguments (camera's speed, whether joints reverse) of a mode."""
+    """The traced arguments of a mode: camera's speed, whether joints reverse and stand still."""
     if mode not in MODES:
         raise unknown_name("video mode", mode, MODES)
     if frames < 2:
         raise CaperError(f"a video needs at least 2 frames, got {frames}")
-    return jnp.float32(MODES[mode].camera_speed), jnp.asarray(MODES[mode].reverses)
+    moves = MODES[mode]
+    return jnp.float32(moves.camera_speed), jnp.asarray(moves.reverses), jnp.asarray(moves.still)
 
 
 # The mode is traced, so that one compiled program serves all of them.
 @partial(jax.jit, static_argnames=("category", "config", "frames"))
 def _video(
-    key, instance: Bank, speed, reverses, category: Category, config: GeneratorConfig, frames: int
+    key,
+    instance: Bank,
+    speed,
+    reverses,
+    still,
+    category: Category,
+    config: GeneratorConfig,
+    frames: int,
 ) -> Batch:
     state_key, camera_key, arc_key, shared_key, frame_key = jax.random.split(key, 5)
     view, diagonal = category.viewpoint, rest_diagonal(instance)
-    states = _states(state_key, instance.limits, reverses, frames)
+    states = _states(state_key, instance.limits, reverses, still, frames)
     cameras = camera_arc(arc_key, draw_camera(camera_key, view), view, frames, speed)
     shared = Keys(*jax.random.split(shared_key, len(Keys._fields)))
     mix = sensors.sensor_mix(config.noise)
@@ -112,6 +125,7 @@ def _batch(
     bank: Bank,
     speed,
     reverses,
+    still,
     category: Category,
     config: GeneratorConfig,
     frames: int,
@@ -122,19 +136,20 @@ def _batch(
     instances = jax.tree.map(lambda values: values[index], bank)
 
     def one(key, instance):
-        return _video(key, instance, speed, reverses, category, config, frames)
+        return _video(key, instance, speed, reverses, still, category, config, frames)
 
     batch = jax.vmap(one)(jax.random.split(rest, videos), instances)
     return replace(batch, instance=jnp.broadcast_to(index[:, None], (videos, frames)))
 
 
-def _states(key, limits, reverses, frames: int):
+def _states(key, limits, reverses, still, frames: int):
     """Joint states [T, J] of a clip from the limits [J, 2]."""
     joints = limits.shape[0]
     uniform = jax.random.uniform(key, (frames + 3, joints))
     first, last, turn, steps = uniform[0], uniform[1], uniform[2], 0.5 + uniform[3:]
     passed = jnp.cumsum(steps, axis=0)
     share = (passed - passed[:1]) / (passed[-1:] - passed[:1])  # from 0 to 1
+    share = jnp.where(still, turn, share)
     # There and back: up to the turn, drawn for each joint around the middle, then down again.
     turn = 0.4 + 0.2 * turn
     there_and_back = jnp.minimum(share / turn, (1.0 - share) / (1.0 - turn))

@@ -1,0 +1,222 @@
+"""``caper reproduce``: the paper's tables, measured again and set beside its figures."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from caper_jax.cli import benchmark, common
+
+if TYPE_CHECKING:
+    from caper_jax.evaluation.tables.options import Options
+    from caper_jax.evaluation.tables.render import Report
+
+_TRACKING = (
+    *("category", "videos", "frames", "mode", "data", "format", "split", "weights", "seed"),
+    "network_alone",
+)
+_MOVING = ("category", "videos", "frames", "weights", "seed", "network_alone")
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """One subcommand.
+
+    Attributes:
+      module: of ``caper_jax.evaluation.tables``, with ``run(name, options) -> Report``; imported
+        only when it runs.
+      summary: one line for --help.
+      options: those of ``OPTIONS`` that it takes, besides --out.
+    """
+
+    module: str
+    summary: str
+    options: tuple[str, ...]
+
+
+REPRODUCTIONS = {
+    "table4": Reproduction(
+        "tracking", "pose tracking, ReArt-Videos categories", (*_TRACKING, "given_masks")
+    ),
+    "table5": Reproduction(
+        "tracking", "pose tracking, seven parts of an arm", (*_TRACKING, "given_masks")
+    ),
+    "table6": Reproduction(
+        "tracking", "pose tracking, PM-Videos categories", (*_TRACKING, "given_masks")
+    ),
+    "table9": Reproduction(
+        "increments",
+        "Lie against Euclidean increments; trains both",
+        (
+            *("category", "videos", "frames", "mode", "data", "format", "split", "seed"),
+            *("seeds", "minutes", "steps", "overrides"),
+        ),
+    ),
+    "table10": Reproduction(
+        "keyframes", "keyframes none, fixed or dynamic; error against frame", _TRACKING
+    ),
+    "jitter": Reproduction("jitter", "trembling on an object that stands still", _MOVING),
+    "modes": Reproduction("modes", "errors by how camera and joints move", _MOVING),
+}
+
+# Field of ``Options`` -> its arguments to argparse.
+OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
+    "category": (
+        "--category",
+        {"action": "append", "default": [], "help": "may be repeated (default: all there are)"},
+    ),
+    "videos": (
+        "--videos",
+        {
+            "type": common.positive_int,
+            "metavar": "N",
+            "help": "per category (default: the paper's)",
+        },
+    ),
+    "frames": (
+        "--frames",
+        {
+            "type": common.positive_int,
+            "metavar": "T",
+            "help": "of each generated video (default: the paper's)",
+        },
+    ),
+    "mode": (
+        "--mode",
+        {
+            "default": "paper",
+            "choices": ("paper", "cam", "hard"),
+            "help": "how generated videos move (default: %(default)s)",
+        },
+    ),
+    "data": (
+        "--data",
+        {"type": Path, "metavar": "ROOT", "help": "measure on a data set instead"},
+    ),
+    "format": ("--format", {"help": "layout of --data, as for caper evaluate"}),
+    "split": ("--split", {"default": "test", "help": "of --data (default: %(default)s)"}),
+    "weights": (
+        "--weights",
+        {
+            "type": Path,
+            "metavar": "DIR",
+            "help": "model directory, or folder with one per category (default: the shipped ones)",
+        },
+    ),
+    "seed": (
+        "--seed",
+        {
+            "type": common.non_negative_int,
+            "default": 0,
+            "help": "of generated videos (default: %(default)s)",
+        },
+    ),
+    "given_masks": (
+        "--given-masks",
+        {"action": "store_true", "help": "add rows with the data's part labels"},
+    ),
+    "network_alone": (
+        "--network-alone",
+        {"action": "store_true", "help": "track without registration, as the paper does"},
+    ),
+    "seeds": (
+        "--seeds",
+        {
+            "type": common.positive_int,
+            "default": 3,
+            "metavar": "N",
+            "help": "runs of each kind (default: %(default)s)",
+        },
+    ),
+    "minutes": (
+        "--minutes",
+        {"type": common.positive_float, "help": "of training per run (default: 60)"},
+    ),
+    "steps": (
+        "--steps",
+        {"type": common.positive_int, "help": "of training per run, instead of --minutes"},
+    ),
+    "overrides": (
+        "--set",
+        {
+            "action": "append",
+            "default": [],
+            "dest": "overrides",
+            "metavar": "KEY=VALUE",
+            "help": "another setting of the runs, as for caper train; may be repeated",
+        },
+    ),
+}
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = common.create_parser(
+        "reproduce",
+        "Measures what a table of the paper shows and prints the paper's figures, ours, and what\n"
+        "ours were measured on. Writes the same as markdown and JSON, and pictures of curves.",
+        [
+            ("table6 --category laptop", "one category, on generated videos"),
+            ("table6 --data PM-Videos --format pm-videos", "on the paper's data"),
+            ("table10 --weights runs/arm --frames 1000", "errors against frame, long videos"),
+            ("table9 --category box --seeds 3 --minutes 30", "trains six models"),
+            ("jitter --category box --videos 4", "a quick look"),
+        ],
+    )
+    commands = parser.add_subparsers(dest="reproduction", required=True, metavar="WHAT")
+    for name, reproduction in REPRODUCTIONS.items():
+        summary = reproduction.summary
+        command = commands.add_parser(name, help=summary, description=summary)
+        for option in reproduction.options:
+            flag, arguments = OPTIONS[option]
+            command.add_argument(flag, **arguments)
+        command.add_argument(
+            "--out",
+            type=Path,
+            default=Path("outputs") / "reproduce",
+            help="folder of results, generated videos and runs (default: %(default)s)",
+        )
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    arguments = vars(build_parser().parse_args(sys.argv[1:] if argv is None else argv))
+    name = arguments.pop("reproduction")
+    from caper_jax.evaluation.tables.options import Options
+    from caper_jax.evaluation.tables.render import markdown, write_report
+
+    values: dict[str, Any] = {
+        key: tuple(v) if isinstance(v, list) else v for key, v in arguments.items()
+    }
+    options = Options(**values)
+    common.check_folder(options.out, "--out")
+    module = importlib.import_module(f"caper_jax.evaluation.tables.{REPRODUCTIONS[name].module}")
+    report = _with_machine(module.run(name, options))
+    options.out.mkdir(parents=True, exist_ok=True)
+    written = [*write_report(options.out, name, report), *_write_curves(options, name, report)]
+    print(markdown(report))
+    print(f"written: {', '.join(map(str, written))}")
+    return 0
+
+
+def _with_machine(report: Report) -> Report:
+    """The report with the machine that its times were measured on."""
+    machine = benchmark.machine()
+    fact = "machine: " + ", ".join(f"{name} {value}" for name, value in machine.items())
+    result = {**report.result, "machine": machine}
+    return replace(report, facts=[*report.facts, fact], result=result)
+
+
+def _write_curves(options: Options, name: str, report: Report) -> list[Path]:
+    """Writes the report's pictures; returns their paths."""
+    from caper_jax.visualization.curves import write_curves
+
+    paths = {options.out / f"{name}_{end}.png": curves for end, curves in report.curves.items()}
+    for path, curves in paths.items():
+        write_curves(path, curves)
+    return list(paths)

@@ -1,0 +1,58 @@
+"""What a reproduction is asked for; each takes the options it names and leaves the others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from caper_jax.errors import unknown_name
+
+
+@dataclass(frozen=True)
+class Options:
+    """Choices of one run; None stands for the reproduction's own default.
+
+    Attributes:
+      out: folder of the results; generated videos and trained runs are kept there too.
+      category: a subset of the reproduction's categories; empty for all.
+      videos, frames: of each category's test set, and of each of its generated videos.
+      mode: how generated videos move, see ``data.synthetic.videos.MODES``.
+      data, format, split: a data set to measure on instead of generated videos.
+      weights: a model directory, or a folder with one per category.
+      seed: of the generated videos.
+      given_masks: add runs with the data's part labels.
+      network_alone: track by the network's increment, without registration.
+      seeds: runs to train of each kind.
+      minutes, steps: budget of each of them; one of the two.
+      overrides: KEY=VALUE, other settings of these runs.
+    """
+
+    out: Path
+    category: tuple[str, ...] = ()
+    videos: int | None = None
+    frames: int | None = None
+    mode: str = "paper"
+    data: Path | None = None
+    format: str | None = None
+    split: str = "test"
+    weights: Path | None = None
+    seed: int = 0
+    given_masks: bool = False
+    network_alone: bool = False
+    seeds: int = 3
+    minutes: float | None = None
+    steps: int | None = None
+    overrides: tuple[str, ...] = ()
+
+    def chosen(self, known: Iterable[str]) -> list[str]:
+        """The categories to measure, in the order of ``known``.
+
+        Raises:
+          CaperError: one that the table does not have.
+        """
+        known = list(known)
+        for name in self.category:
+            if name not in known:
+                raise unknown_name("category of this table", name, known)
+        return [name for name in known if name in self.category or not self.category]

@@ -1,0 +1,166 @@
+"""Runs of a tracker under the conditions of a table: models, videos, and one row's label."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from caper_jax import categories
+from caper_jax.articulation.category import Category
+from caper_jax.errors import CaperError
+from caper_jax.estimator import Estimator, load, shipped_weights
+from caper_jax.evaluation.tables.options import Options
+from caper_jax.evaluation.tables.videos import Videos, dataset_videos, generated_videos
+from caper_jax.evaluation.tracking import Start, Track, summarise_tracks, track_video
+from caper_jax.model_files import CARD_FILE, read_model
+from caper_jax.progress import progress
+from caper_jax.tracker import Tracker
+from caper_jax.tracking.config import TrackerConfig
+
+NO_MODEL = "no model"
+NO_DATA = "no data"
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What a tracker is given besides the clouds.
+
+    Attributes:
+      start: see ``track_video``.
+      given_masks: hand over the data's part labels.
+    """
+
+    start: Start = "truth"
+    given_masks: bool = False
+
+    @property
+    def part_masks(self) -> str:
+        return "given" if self.given_masks else "predicted"
+
+    @property
+    def label(self) -> str:
+        """For people, as a row of a table."""
+        pose = "given" if self.start == "truth" else "estimated"
+        return f"{pose}, part masks given" if self.given_masks else pose
+
+
+def conditions(options: Options) -> list[Condition]:
+    """The paper's first, then the first pose estimated, then (if asked) with part labels."""
+    rows = [Condition(), Condition("estimator")]
+    return rows + [Condition(given_masks=True)] if options.given_masks else rows
+
+
+def tracker_config(options: Options) -> TrackerConfig:
+    """The default one, or the one whose poses are the network's increments alone."""
+    return network_alone(TrackerConfig()) if options.network_alone else TrackerConfig()
+
+
+def network_alone(config: TrackerConfig) -> TrackerConfig:
+    """Without registration: the paper's tracker."""
+    return replace(config, registration=replace(config.registration, steps=0))
+
+
+def describe_tracker(options: Options) -> str:
+    """For people."""
+    if options.network_alone:
+        return "tracker: the network's increments alone, without registration"
+    return "tracker: the network's increments, refined by registration (beyond the paper)"
+
+
+def find_model(category: str, weights: Path | None) -> Estimator | None:
+    """The model of a category; None where there is none, which is no error.
+
+    Args:
+      category: its name, or FILE.py:NAME.
+      weights: a model directory, or a folder with one per category, named like it; None for the
+        package's own.
+
+    Raises:
+      CaperError: unknown category, a damaged model, or a folder without any.
+    """
+    category = categories.get(category).name
+    if weights is None:
+        present = (shipped_weights() / category).is_dir()
+        return load(category) if present else None
+    if (weights / CARD_FILE).is_file():
+        return load(category, weights) if _model_category(weights) == category else None
+    if not any(weights.glob(f"*/{CARD_FILE}")):
+        raise CaperError(f"--weights {weights}: neither a model directory nor a folder of them")
+    directory = weights / category
+    return load(category, directory) if directory.is_dir() else None
+
+
+def need_models(names: Sequence[str], weights: Path | None) -> dict[str, Estimator]:
+    """The models of some categories; of all that have one, where none is named.
+
+    Raises:
+      CaperError: a named category without a model, or no model at all.
+    """
+    found = {
+        categories.get(name).name: find_model(name, weights) for name in names or categories.names()
+    }
+    missing = [name for name, model in found.items() if model is None]
+    models = {name: model for name, model in found.items() if model is not None}
+    if not models or (names and missing):
+        raise CaperError(
+            f"there is no model of {', '.join(missing)}; train some and pass their folder as "
+            "--weights"
+        )
+    return models
+
+
+def _model_category(directory: Path) -> Any:
+    """The category that a model's card names."""
+    return read_model(directory)[0].get("category")
+
+
+def open_videos(
+    options: Options, category: Category, mode: str, videos: int, frames: int
+) -> Videos | None:
+    """The videos to measure on; None where the data set has none of this category.
+
+    Args:
+      options: name the data set, or how to generate.
+      category: to show.
+      mode, videos, frames: of generated videos, as far as the options do not say otherwise.
+
+    Raises:
+      CaperError: see ``generated_videos`` and ``dataset_videos``.
+    """
+    if options.data is not None:
+        if options.format is None:
+            raise CaperError("--data needs --format, the layout of the data")
+        return dataset_videos(options.format, options.data, category, options.split, options.videos)
+    return generated_videos(
+        options.out / "videos",
+        category,
+        mode,
+        options.videos or videos,
+        options.frames or frames,
+        options.seed,
+    )
+
+
+def track_all(tracker: Tracker, videos: Videos, condition: Condition) -> list[Track]:
+    """Tracks through every video."""
+    tracks = []
+    title = f"tracking {videos.category.name} (first pose {condition.label})"
+    with progress(title, total=len(videos.index)) as bar:
+        for name in videos.index:
+            arguments = (name, videos.frames(name), condition.start, condition.given_masks)
+            tracks.append(track_video(tracker, *arguments))
+            bar.update(1)
+    return tracks
+
+
+def summarise(tracks: Sequence[Track], videos: Videos, condition: Condition) -> dict[str, Any]:
+    """Metrics of the tracks over all frames but the first, JSON-ready."""
+    return summarise_tracks(
+        tracks,
+        videos.category,
+        condition.start,
+        videos.dataset.mask_source,
+        condition.part_masks,
+    )

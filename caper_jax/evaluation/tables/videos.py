@@ -1,0 +1,160 @@
+"""Videos to measure on: generated ones, drawn once and kept, or those of a data set."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from caper_jax._version import __version__
+from caper_jax.articulation.category import Category
+from caper_jax.data import categories_in, hdf5, open_dataset
+from caper_jax.data.schema import Dataset, Frame
+from caper_jax.data.synthetic.config import GeneratorConfig
+from caper_jax.data.synthetic.videos import VideoGenerator
+from caper_jax.errors import CaperError
+from caper_jax.progress import progress
+
+# The paper's clouds have 1,024 points; its sensor noise is not stated.
+TEST_DATA = GeneratorConfig(instances=100, grid=128, num_points=1024, noise=("kinect",))
+SPLIT = "test"
+_BATCH = 2  # videos drawn at a time
+
+
+@dataclass(frozen=True)
+class Videos:
+    """Labelled videos of one category.
+
+    Attributes:
+      category: what they show.
+      dataset: holds their frames.
+      index: name of each video -> its frames in ``dataset``, in the order of time.
+      description: for people.
+    """
+
+    category: Category
+    dataset: Dataset
+    index: dict[str, list[int]]
+    description: str
+
+    def frames(self, name: str) -> Iterator[Frame]:
+        """The frames of one video."""
+        return (self.dataset[index] for index in self.index[name])
+
+
+def generated_videos(
+    folder: Path,
+    category: Category,
+    mode: str,
+    videos: int,
+    frames: int,
+    seed: int = 0,
+    config: GeneratorConfig = TEST_DATA,
+) -> Videos:
+    """Videos of test instances; those of an earlier call with the same arguments are read again.
+
+    Args:
+      folder: keeps one file per set of arguments; made if it does not exist.
+      category: has procedural shapes.
+      mode: of ``data.synthetic.videos.MODES``.
+      videos, frames: how many, and of what length.
+      seed: of shapes and videos.
+      config: what the frames look like.
+
+    Raises:
+      CaperError: see ``VideoGenerator``; a damaged file.
+    """
+    generator = VideoGenerator(category, config, mode, frames, SPLIT, seed)
+    noise = ",".join(config.noise)
+    wanted: dict[str, Any] = {
+        "generator": __version__,
+        "noise": noise,
+        "seed": seed,
+        "instances": config.instances,
+        "grid": config.grid,
+        "mode": mode,
+        "shapes": _fingerprint(generator),
+    }
+    points = config.num_points
+    path = folder / f"{category.name}_{mode}_{videos}x{frames}x{points}_seed{seed}.h5"
+    kept = hdf5.Hdf5Dataset(path, category.name, SPLIT) if path.is_file() else None
+    if kept is None or any(kept.attributes.get(key) != value for key, value in wanted.items()):
+        folder.mkdir(parents=True, exist_ok=True)
+        _draw(path, generator, videos, seed, wanted)
+        kept = hdf5.Hdf5Dataset(path, category.name, SPLIT)
+    return Videos(
+        category,
+        kept,
+        kept.videos,
+        f"{videos} generated videos of {frames} frames, mode {mode}, noise {noise}, seed {seed}, "
+        "of test instances, which training never shows",
+    )
+
+
+def dataset_videos(
+    format: str, root: Path, category: Category, split: str | None, videos: int | None
+) -> Videos | None:
+    """The first videos of a data set; None where it holds none of this category.
+
+    Args:
+      format, root, split: see ``open_dataset``.
+      category: to read.
+      videos: at most so many.
+
+    Raises:
+      CaperError: see ``open_dataset``; data that are no videos.
+    """
+    if category.name not in categories_in(format, root):
+        return None
+    dataset = open_dataset(format, root, category.name, split)
+    found = getattr(dataset, "videos", {})
+    index: dict[str, list[int]] = found() if callable(found) else found
+    if not index:
+        raise CaperError(f"{root}: {format} holds single frames, no videos, of {category.name}")
+    index = dict(list(index.items())[:videos])
+    frames = sum(map(len, index.values()))
+    description = f"{len(index)} videos, {frames} frames, of {root} ({format}, split {split})"
+    return Videos(category, dataset, index, description)
+
+
+def _draw(path: Path, generator: VideoGenerator, videos: int, seed: int, attributes) -> None:
+    """Draws the videos and writes them to a file."""
+    key = jax.random.key(seed)
+    batches = []
+    with progress(f"generating {generator.category.name} videos", total=videos) as bar:
+        for start in range(0, videos, _BATCH):
+            count = min(_BATCH, videos - start)
+            batch = generator.batch(jax.random.fold_in(key, start), _BATCH)
+            batches.append(jax.tree.map(lambda array, n=count: np.asarray(array)[:n], batch))
+            bar.update(count)
+    batch = jax.tree.map(
+        lambda *arrays: np.concatenate(arrays).reshape(-1, *arrays[0].shape[2:]), *batches
+    )
+    video, frame = np.divmod(np.arange(len(batch.points)), generator.frames)
+    hdf5.write(
+        path,
+        category=generator.category,
+        split=SPLIT,
+        points=batch.points,
+        labels=batch.labels,
+        pose=batch.pose,
+        visible=batch.visible,
+        instance=batch.instance,
+        names=[f"{v:05d}/{f:06d}" for v, f in zip(video, frame, strict=True)],
+        video=video,
+        frame=frame,
+        attributes=attributes,
+        overwrite=True,
+    )
+
+
+def _fingerprint(generator: VideoGenerator) -> int:
+    """Changes with the shapes, so that videos of other shapes are not taken for these."""
+    bank = generator.bank
+    arrays = (bank.size, bank.box_center, bank.limits, bank.joint_pivot)
+    return zlib.crc32(b"".join(np.asarray(array).tobytes() for array in arrays))
