@@ -118,6 +118,15 @@ def positive_float(text: str) -> float:
     return _checked(float, text, "a number above 0", lambda value: 0 < value < math.inf)
 
 
+def pixel_box(text: str) -> tuple[float, float, float, float]:
+    """Argument type: x1,y1,x2,y2 in pixels."""
+    try:
+        x1, y1, x2, y2 = (float(value) for value in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not x1,y1,x2,y2 in pixels") from None
+    return x1, y1, x2, y2
+
+
 def _checked(
     convert: Callable[[str], Number], text: str, wanted: str, accept: Callable[[Number], bool]
 ) -> Number:

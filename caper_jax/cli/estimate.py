@@ -60,7 +60,9 @@ def build_parser() -> argparse.ArgumentParser:
     )
     region = parser.add_mutually_exclusive_group()
     region.add_argument("--mask", type=Path, help="image of the same size, not black on the object")
-    region.add_argument("--box", type=_box, help="x1,y1,x2,y2 in pixels around the object")
+    region.add_argument(
+        "--box", type=common.pixel_box, help="x1,y1,x2,y2 in pixels around the object"
+    )
     parser.add_argument(
         "--intrinsics", type=Path, help="camera as JSON: fx, fy, cx, cy, or K, or Open3D pinhole"
     )
@@ -120,15 +122,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         write_page(arguments.page, [scene])
     return 0
-
-
-def _box(text: str) -> tuple[float, float, float, float]:
-    """Argument type: x1,y1,x2,y2."""
-    try:
-        x1, y1, x2, y2 = (float(value) for value in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not x1,y1,x2,y2 in pixels") from None
-    return x1, y1, x2, y2
 
 
 def _check_outputs(arguments: argparse.Namespace) -> None:

@@ -174,7 +174,7 @@ def format_report(report: dict[str, Any]) -> str:
         f"{1000 * report['seconds_per_frame']:.1f} ms per frame",
         "each cell: mean / median",
         "",
-        *_format_tables(report),
+        *format_tables(report),
     ]
     if "by_occlusion" in report:
         lines += ["", "by the share of the part that is occluded:"]
@@ -182,7 +182,7 @@ def format_report(report: dict[str, Any]) -> str:
     if "up_to_symmetry" in report:
         symmetric = report["up_to_symmetry"]
         lines += ["", f"up to symmetry ({'; '.join(symmetric['reasons'])}):"]
-        lines += _format_tables(symmetric)
+        lines += format_tables(symmetric)
     return "\n".join(lines)
 
 
@@ -200,7 +200,8 @@ def _format_occlusion(bins: list[dict[str, Any]]) -> list[str]:
     return align(rows)
 
 
-def _format_tables(tables: dict[str, Any]) -> list[str]:
+def format_tables(tables: dict[str, Any]) -> list[str]:
+    """Lines of the tables of parts and joints that ``error_tables`` gives, mean / median."""
     rows = [["part", "rotation [deg]", "translation [mm]", "IoU full", "IoU size"]]
     for part in tables["parts"]:
         rows.append(

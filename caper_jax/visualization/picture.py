@@ -70,7 +70,7 @@ def write_picture(path: str | Path, scenes: Sequence[Scene]) -> Path:
     for row, scene in enumerate(scenes):
         axes = [figure.add_subplot(grid[row, column]) for column in range(4)]
         _draw_input(axes[0], scene)
-        _draw_estimate(axes[1], scene)
+        draw_estimate(axes[1], scene)
         _draw_side(axes[2], scene)
         _draw_legend(axes[3], scene)
         if row == 0:
@@ -117,8 +117,8 @@ def _draw_input(axes: Axes, scene: Scene) -> None:
     bar.tick_params(labelsize=8, length=2, pad=1)
 
 
-def _draw_estimate(axes: Axes, scene: Scene) -> None:
-    """The estimate projected into the image."""
+def draw_estimate(axes: Axes, scene: Scene) -> None:
+    """The estimate of a scene with points, projected into its image."""
     _frame(axes)
     axes.set_facecolor(PAPER)
     if scene.depth is not None:

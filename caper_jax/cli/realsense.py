@@ -1,0 +1,119 @@
+"""Sends what stands on the table before a RealSense camera to ``caper track --live``.
+
+Run as ``python -m caper_jax.cli.realsense --box x1,y1,x2,y2 | caper track ... --live -``, or into
+``nc -lk 5000`` and track from another machine with ``--live HOST:5000``. The camera is read
+through pyrealsense2, which this package does not install.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from caper_jax.cli import common
+from caper_jax.data.cloud import cloud_from_depth
+from caper_jax.data.live import pack_frame
+from caper_jax.data.plane import mask_from_box
+from caper_jax.errors import CaperError
+
+NUM_POINTS = 1024
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m caper_jax.cli.realsense",
+        description="Writes the clouds of the object inside a fixed box of the depth image to\n"
+        "standard output, in the format of caper_jax/data/live.py. The table that it stands on is\n"
+        "taken away; a frame in which nothing stands there has no points.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--box", required=True, type=common.pixel_box, help="x1,y1,x2,y2 in pixels of the depth"
+    )
+    parser.add_argument(
+        "--size",
+        type=common.positive_int,
+        nargs=2,
+        default=(640, 480),
+        metavar=("WIDTH", "HEIGHT"),
+        help="of the depth image (default: 640 480)",
+    )
+    parser.add_argument(
+        "--rate", type=common.positive_int, default=30, help="frames per second (default: 30)"
+    )
+    parser.add_argument("--limit", type=common.positive_int, help="stop after so many frames")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the feeder; returns its exit code."""
+    arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
+    x1, y1, x2, y2 = arguments.box
+    width, height = arguments.size
+    if not (max(x1, 0) < min(x2, width) and max(y1, 0) < min(y2, height)):
+        raise CaperError(f"--box {x1:g},{y1:g},{x2:g},{y2:g} is empty in {width} x {height} pixels")
+    if sys.stdout.isatty():
+        raise CaperError("frames are bytes, no text: pipe them into caper track --live -")
+    for number, (depth, intrinsics) in enumerate(camera_frames(width, height, arguments.rate)):
+        sys.stdout.buffer.write(pack_frame(object_points(depth, intrinsics, arguments.box), number))
+        sys.stdout.buffer.flush()
+        if number + 1 == arguments.limit:
+            break
+    return 0
+
+
+def object_points(
+    depth: np.ndarray, intrinsics: np.ndarray, box: tuple[float, float, float, float]
+) -> np.ndarray:
+    """[N, 3] metres of what stands on the table inside the box; none where nothing does."""
+    try:
+        mask = mask_from_box(depth, intrinsics, box)
+        return cloud_from_depth(depth, mask, intrinsics, NUM_POINTS).points
+    except CaperError:
+        return np.zeros((0, 3), np.float32)
+
+
+def camera_frames(width: int, height: int, rate: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Depth images [H, W] in metres and intrinsics [3, 3] of the first camera found, endlessly.
+
+    Raises:
+      CaperError: pyrealsense2 is not installed, or no camera gives such images.
+    """
+    try:
+        realsense: Any = importlib.import_module("pyrealsense2")
+    except ImportError as error:
+        raise CaperError(
+            f"cannot import pyrealsense2 ({error}); install it with pip install pyrealsense2"
+        ) from error
+    pipeline, config = realsense.pipeline(), realsense.config()
+    config.enable_stream(realsense.stream.depth, width, height, realsense.format.z16, rate)
+    try:
+        profile = pipeline.start(config)
+    except RuntimeError as error:
+        raise CaperError(
+            f"no RealSense camera gives depth of {width} x {height} at {rate} Hz ({error})"
+        ) from error
+    try:
+        unit = profile.get_device().first_depth_sensor().get_depth_scale()
+        stream = profile.get_stream(realsense.stream.depth).as_video_stream_profile()
+        camera = stream.get_intrinsics()
+        intrinsics = np.array(
+            [[camera.fx, 0.0, camera.ppx], [0.0, camera.fy, camera.ppy], [0.0, 0.0, 1.0]]
+        )
+        while True:
+            try:
+                image = pipeline.wait_for_frames().get_depth_frame()
+            except RuntimeError as error:
+                raise CaperError(f"the camera stopped sending ({error})") from error
+            yield np.asanyarray(image.get_data()).astype(np.float32) * np.float32(unit), intrinsics
+    finally:
+        pipeline.stop()
+
+
+if __name__ == "__main__":
+    sys.exit(common.run(main, sys.argv[1:], command="realsense"))

@@ -1,0 +1,201 @@
+"""The part of ``caper track`` that goes through recorded videos."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from caper_jax.cli.track import VIDEO_FORMATS
+from caper_jax.configuration import to_dict
+from caper_jax.data import open_dataset
+from caper_jax.data.depth_folder import FORMAT as FOLDER
+from caper_jax.data.depth_folder import DepthFolder, is_depth_folder
+from caper_jax.data.schema import Dataset, Frame
+from caper_jax.errors import CaperError, unknown_name
+from caper_jax.estimator import load
+from caper_jax.evaluation.report import METRICS_FILE
+from caper_jax.evaluation.track_report import format_tracks, json_line, track_records
+from caper_jax.evaluation.tracking import Track, summarise_tracks, track_video
+from caper_jax.files import write_atomically
+from caper_jax.progress import Progress, progress
+from caper_jax.tracker import Tracker
+from caper_jax.tracking.config import TrackerConfig
+from caper_jax.tracking.step import Tracked
+from caper_jax.visualization.scene import Scene
+from caper_jax.visualization.track import Tile, evenly_spaced, write_sheet, write_states
+
+
+class Recorder(Tracker):
+    """A tracker that remembers the parts of all points since its last reset, for pictures.
+
+    Attributes:
+      labels: [N] of every frame.
+    """
+
+    labels: list[Any]
+
+    def reset(self, points=None, rotation=None, translation=None, labels=None) -> None:
+        super().reset(points, rotation, translation, labels)
+        self.labels = []
+
+    def __call__(self, points, labels=None) -> Tracked:
+        result = super().__call__(points, labels)
+        self.labels.append(result.labels)
+        return result
+
+
+def load_recorder(category: str, weights: Path | None, config: TrackerConfig) -> Recorder:
+    """The tracker of a category; see ``load_tracker``."""
+    recorder = Recorder(load(category, weights), config)
+    recorder.reset()
+    return recorder
+
+
+def open_videos(
+    arguments: argparse.Namespace, category: str
+) -> tuple[Dataset, dict[str, list[int]]]:
+    """The dataset and the chosen videos: name -> indices of the frames, in the order of time.
+
+    Raises:
+      CaperError: no such data, a layout that cannot be told or has no videos, options that do not
+        go with it, or a video that it does not hold.
+    """
+    layout = arguments.format or _guess_format(arguments.data)
+    if layout not in VIDEO_FORMATS:
+        raise unknown_name("format of videos", layout, VIDEO_FORMATS)
+    dataset: Dataset
+    if layout == FOLDER:
+        if arguments.split is not None or arguments.official_split:
+            raise CaperError("--split and --official-split: a folder of depth images has no splits")
+        dataset = DepthFolder(arguments.data, category, depth_scale=arguments.depth_scale)
+    else:
+        if arguments.depth_scale is not None:
+            raise CaperError(f"--depth-scale goes with --format {FOLDER}, not {layout}")
+        dataset = open_dataset(
+            layout, arguments.data, category, arguments.split, arguments.official_split
+        )
+    found: Any = dataset.videos  # type: ignore[attr-defined]
+    videos: dict[str, list[int]] = found() if callable(found) else found
+    if not videos:
+        raise CaperError(
+            f"{arguments.data}: holds single frames, no videos; measure them with caper evaluate"
+        )
+    for name in arguments.video or ():
+        if name not in videos:
+            raise unknown_name("video", name, videos)
+    chosen = [name for name in videos if arguments.video is None or name in arguments.video]
+    return dataset, {name: videos[name] for name in chosen[: arguments.limit]}
+
+
+def _guess_format(data: Path) -> str:
+    if not data.exists():
+        raise CaperError(f"--data {data}: no such file or folder")
+    if data.is_file():
+        return "caper"
+    if is_depth_folder(data):
+        return FOLDER
+    raise CaperError(f"--data {data}: give --format, one of {', '.join(VIDEO_FORMATS)}")
+
+
+def track_all(
+    arguments: argparse.Namespace,
+    tracker: Recorder,
+    dataset: Dataset,
+    videos: dict[str, list[int]],
+) -> None:
+    """Tracks through the videos, writes everything to ``--out`` and prints the tables.
+
+    Every video's files are written before the next one begins.
+    """
+    category, config, out = dataset.category, tracker.config, arguments.out
+    threshold = config.threshold if config.policy in ("dynamic", "promote") else None
+    out.mkdir(parents=True, exist_ok=True)
+    tracks = []
+    with progress("loading, compiling, tracking", sum(map(len, videos.values()))) as bar:
+        for (name, indices), stem in zip(videos.items(), file_stems(videos), strict=True):
+            kept: dict[int, Frame] = {}
+            frames = _frames(dataset, indices, kept, bar)
+            track = track_video(tracker, name, frames, arguments.start, arguments.given_masks)
+            lines = "".join(json_line(row) + "\n" for row in track_records(track, category))
+            write_atomically(out / f"{stem}.jsonl", lines.encode())
+            tiles = [_tile(number, frame, track, tracker) for number, frame in kept.items()]
+            write_sheet(out / f"{stem}.png", name, tiles)
+            write_states(out / f"{stem}_states.png", track, category, threshold)
+            tracks.append(track)
+    part_masks = "given" if arguments.given_masks else "predicted"
+    facts = (arguments.start, dataset.mask_source, part_masks)
+    measured = [track for track in tracks if track.truth is not None]
+    metrics = None
+    if sum(len(track.frames) - 1 for track in measured):
+        metrics = summarise_tracks(measured, category, *facts)
+        metrics |= {
+            "format": dataset.format,
+            "split": dataset.split,
+            "weights": str(arguments.weights or f"shipped with the package ({category.name})"),
+            "tracker": to_dict(config),
+        }
+        text = json.dumps(metrics, indent=2, allow_nan=False)
+        write_atomically(out / METRICS_FILE, text.encode() + b"\n")
+    print(format_tracks(tracks, category, config, *facts, metrics))
+    written = [METRICS_FILE] if metrics is not None else []
+    stem = file_stems(videos)[0] if len(videos) == 1 else "<video>"
+    written += [f"{stem}.jsonl", f"{stem}.png", f"{stem}_states.png"]
+    print(f"\nwritten to {out}: {', '.join(written)}")
+
+
+def file_stems(videos: Iterable[str]) -> list[str]:
+    """A name for the files of each video: no separators, none twice on any file system."""
+    stems: list[str] = []
+    taken: set[str] = set()
+    for name in videos:
+        plain = re.sub(r"[^\w.-]+", "-", name).strip(".-") or "video"
+        stem, number = plain, 1
+        while taken & _names_of(stem):
+            number += 1
+            stem = f"{plain}-{number}"
+        taken |= _names_of(stem)
+        stems.append(stem)
+    return stems
+
+
+def _names_of(stem: str) -> set[str]:
+    return {stem.casefold(), f"{stem}_states".casefold()}
+
+
+def _frames(
+    dataset: Dataset, indices: Sequence[int], kept: dict[int, Frame], bar: Progress
+) -> Iterator[Frame]:
+    """The frames of a video; those for its contact sheet stay in ``kept``, by number."""
+    wanted = set(evenly_spaced(len(indices)))
+    for number, index in enumerate(indices):
+        frame = dataset[index]
+        if number in wanted:
+            kept[number] = frame
+        yield frame
+        bar.update(1)
+
+
+def _tile(number: int, frame: Frame, track: Track, tracker: Recorder) -> Tile:
+    observation = tracker.observe(frame.points)
+    # What a frame without the object shows is no part of it.
+    shown = slice(None) if observation.present else slice(0)
+    pose, truth = jax.tree.map(lambda array: array[number], (track.pose, track.truth))
+    scene = Scene(
+        name=frame.name,
+        category=tracker.estimator.category,
+        points=observation.points[shown],
+        labels=np.asarray(tracker.labels[number])[shown],
+        pose=pose,
+        truth=truth,
+        depth=None if frame.depth is None else np.nan_to_num(frame.depth, posinf=0.0, neginf=0.0),
+        mask=frame.mask,
+        intrinsics=frame.intrinsics,
+    )
+    return Tile(number, scene, bool(track.keyframe[number]), bool(track.lost[number]))
