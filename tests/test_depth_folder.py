@@ -1,33 +1,17 @@
 """Folders of depth images and masks as videos."""
 
-import json
 import os
 
 import numpy as np
 import pytest
+from depth_videos import write_video
 from PIL import Image
 
 from caper_jax.data.cloud import cloud_from_depth
 from caper_jax.data.depth_folder import DepthFolder, is_depth_folder, natural_order
 from caper_jax.errors import CaperError
 
-CAMERA = {"fx": 90.0, "fy": 95.0, "cx": 31.5, "cy": 23.5}
 MATRIX = np.array([[90.0, 0, 31.5], [0, 95.0, 23.5], [0, 0, 1]])
-
-
-def write_video(home, names=("f1", "f2", "f10")):
-    """A block that comes 100 mm nearer from frame to frame, before a wall."""
-    for kind in ("depth", "mask"):
-        (home / kind).mkdir(parents=True)
-    for number, name in enumerate(names):
-        depth = np.full((48, 64), 2000, np.uint16)
-        mask = np.zeros((48, 64), np.uint8)
-        mask[10:30, 20:50] = 255
-        depth[mask > 0] = 900 - 100 * number
-        Image.fromarray(depth).save(home / "depth" / f"{name}.png")
-        Image.fromarray(mask).save(home / "mask" / f"{name}.png")
-    (home / "intrinsics.json").write_text(json.dumps(CAMERA))
-    return home
 
 
 def test_frames_come_in_natural_order_with_their_clouds(tmp_path):
