@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator
@@ -16,7 +17,6 @@ from caper_jax.evaluation.tables import runs
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.render import Report, Table, number, ratio
 from caper_jax.evaluation.tables.videos import Videos
-from caper_jax.evaluation.tracking import Track
 from caper_jax.geometry import so3
 from caper_jax.tracker import Tracker
 
@@ -25,7 +25,7 @@ VIDEOS, FRAMES = 30, 30
 
 
 def run(name: str, options: Options) -> Report:
-    """Compares the tracker, its first pose given, with estimates of every frame by itself.
+    """Compares the tracker with estimates of every frame by itself.
 
     Args:
       name: of the reproduction.
@@ -40,51 +40,53 @@ def run(name: str, options: Options) -> Report:
     if options.frames is not None and options.frames < 3:
         raise CaperError(f"{name} compares frames after the first; --frames must be 3 or more")
     models = runs.need_models(options.category, options.weights)
-    condition = runs.Condition()
     rows, facts, result = [], [], {}
     for key, estimator in models.items():
         videos = runs.open_videos(options, estimator.category, MODE, VIDEOS, FRAMES)
         assert videos is not None  # generated ones exist for every category
         facts.append(f"{key}: {videos.description}")
-        tracker = Tracker(estimator, runs.tracker_config(options))
-        tracks = runs.track_all(tracker, videos, condition)
-        tracked = tremble([track.pose for track in tracks], _truths(tracks), estimator)
+        truths = [_truths(videos, video) for video in videos.index]
         estimates = [_estimates(estimator, videos, video) for video in videos.index]
-        single = tremble(estimates, _truths(tracks), estimator)
-        result[key] = {"tracked": tracked, "frame_by_frame": single}
-        rows += jitter_rows(key, tracked, single)
-    header = ["category", "part"]
+        single = tremble(estimates, truths, estimator.category)
+        result[key] = {"frame_by_frame": single}
+        tracker = Tracker(estimator, runs.tracker_config(options))
+        for condition in runs.conditions(options):
+            tracks = runs.track_all(tracker, videos, condition)
+            tracked = tremble([track.pose for track in tracks], truths, estimator.category)
+            result[key][f"tracked, first pose {condition.label}"] = tracked
+            rows += jitter_rows(key, condition.label, tracked, single)
+    header = ["category", "part", "first pose"]
     for label in ("turn [deg]", "shift [mm]"):
         header += [f"{label} tracked", "frame by frame", "ratio"]
     header += ["rot error [deg] tracked", "frame by frame"]
     return Report(
         title="Jitter: frame-to-frame change of the pose of an object that stands still",
-        tables=[Table("Root mean square over pairs of successive frames", header, rows, 2)],
+        tables=[Table("Root mean square over pairs of successive frames", header, rows, 3)],
         facts=[
             *facts,
             "still: camera and joints do not move; noise, ray grid and sampling are fresh in every "
             "frame",
-            "tracked: first pose given, pairs from the first tracked frame on; ratio: tracked over "
-            "frame by frame",
+            "pairs from the first frame after the one whose pose was given or estimated; ratio: "
+            "tracked over frame by frame",
             "rot error: mean over the same frames; a tracker that holds still at a wrong pose "
-            "would show there",
+            "shows there",
             runs.describe_tracker(options),
+            "0.000 exactly: registration leaves a root where it is that does not seem to move",
         ],
         result={"categories": result},
     )
 
 
 def tremble(
-    poses: Sequence[ArticulatedPose], truths: Sequence[ArticulatedPose], estimator: Estimator
+    poses: Sequence[ArticulatedPose], truths: Sequence[ArticulatedPose], category: Category
 ) -> list[dict[str, Any]]:
     """Per part: name, RMS changes from frame to frame, mean rotation error; without frame 0.
 
     Args:
       poses: of each video, arrays [T, K, ...], T at least 3.
       truths: likewise.
-      estimator: names the category.
+      category: theirs.
     """
-    category = estimator.category
     turns, shifts, errors = [], [], []
     for pose, truth in zip(poses, truths, strict=True):
         after, true = (jax.tree.map(lambda array: np.asarray(array)[1:], p) for p in (pose, truth))
@@ -108,11 +110,11 @@ def tremble(
     ]
 
 
-def jitter_rows(category: str, tracked, single) -> list[list[str]]:
+def jitter_rows(category: str, label: str, tracked, single) -> list[list[str]]:
     """One row per part of two results of ``tremble``."""
     rows = []
     for ours, other in zip(tracked, single, strict=True):
-        row = [category, ours["name"]]
+        row = [category, ours["name"], label]
         for metric, factor in (("turn_deg", 1.0), ("shift_m", 1000.0)):
             values = ours[metric], other[metric]
             row += [*(number(factor * value, 3) for value in values), number(ratio(*values), 3)]
@@ -121,9 +123,10 @@ def jitter_rows(category: str, tracked, single) -> list[list[str]]:
     return rows
 
 
-def _truths(tracks: Sequence[Track]) -> list[ArticulatedPose]:
-    """Generated videos have ground truth."""
-    return [track.truth for track in tracks if track.truth is not None]
+def _truths(videos: Videos, name: str) -> ArticulatedPose:
+    """Poses [T, K, ...] of a generated video."""
+    truths = [frame.truth for frame in videos.frames(name)]
+    return jax.tree.map(lambda *rows: np.stack(rows), *truths)
 
 
 def _estimates(estimator: Estimator, videos: Videos, name: str) -> ArticulatedPose:

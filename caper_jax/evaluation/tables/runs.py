@@ -7,13 +7,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load, shipped_weights
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.videos import Videos, dataset_videos, generated_videos
-from caper_jax.evaluation.tracking import Start, Track, summarise_tracks, track_video
+from caper_jax.evaluation.tracking import (
+    Start,
+    Track,
+    object_diagonal,
+    summarise_tracks,
+    track_video,
+)
 from caper_jax.model_files import CARD_FILE, read_model
 from caper_jax.progress import progress
 from caper_jax.tracker import Tracker
@@ -156,11 +164,16 @@ def track_all(tracker: Tracker, videos: Videos, condition: Condition) -> list[Tr
 
 
 def summarise(tracks: Sequence[Track], videos: Videos, condition: Condition) -> dict[str, Any]:
-    """Metrics of the tracks over all frames but the first, JSON-ready."""
-    return summarise_tracks(
+    """Metrics of the tracks over all frames but the first, JSON-ready.
+
+    Besides those of ``summarise_tracks``: "mean_diagonal_m" of the objects shown.
+    """
+    summary = summarise_tracks(
         tracks,
         videos.category,
         condition.start,
         videos.dataset.mask_source,
         condition.part_masks,
     )
+    diagonals = [object_diagonal(track.truth) for track in tracks if track.truth is not None]
+    return {**summary, "mean_diagonal_m": float(np.concatenate(diagonals).mean())}

@@ -32,7 +32,10 @@ def run(name: str, options: Options) -> Report:
         found = _measure(key, options, paper.videos, paper.frames)
         result[key] = {"paper": comparison.paper_json(figure), **found}
         if found["runs"]:
-            facts.append(f"{key}: {found['data']}, object masks {found['mask_source']}")
+            facts.append(
+                f"{key}: {found['data']}, mean diagonal "
+                f"{found['runs'][0]['mean_diagonal_m']:.3f} m, object masks {found['mask_source']}"
+            )
         else:
             parts = categories.get(key).parts
             rows += comparison.paper_rows(key, parts, figure, found["missing"])
