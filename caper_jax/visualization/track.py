@@ -107,7 +107,7 @@ def _draw_tile(axes: Axes, tile: Tile) -> None:
         for state, joint in zip(scene.pose.joint_state, scene.category.joints, strict=True)
     ]
     shown = ", ".join(states[:_STATES_SHOWN]) + (", …" if len(states) > _STATES_SHOWN else "")
-    headline = ": ".join([f"frame {tile.number}", *marks])
+    headline = f"frame {tile.number}" + (f": {', '.join(marks)}" if marks else "")
     axes.set_title(f"{headline}\n{shown}", fontsize=9, color=color, pad=4)
 
 
