@@ -21,11 +21,21 @@ from tiny import network, random_variables
 from tracks import BOX, KnownTracker, disturbed, track, write_videos
 
 from caper_jax import categories, cli
+from caper_jax.articulation.equivalence import second_reading
 from caper_jax.cli.reproduce import OPTIONS, REPRODUCTIONS
 from caper_jax.configuration import to_dict
 from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.errors import CaperError
-from caper_jax.evaluation.tables import increments, jitter, keyframes, modes, runs, tracking, videos
+from caper_jax.evaluation.tables import (
+    comparison,
+    increments,
+    jitter,
+    keyframes,
+    modes,
+    runs,
+    tracking,
+    videos,
+)
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.paper import TABLES
 from caper_jax.evaluation.tables.render import Curves, Table, markdown
@@ -138,6 +148,25 @@ def test_errors_stand_beside_the_papers_with_their_ratio(known, tmp_path, capsys
     # Each video: before, after the compiling call and, if the pose is given, with it.
     assert tracker.resets == 2 * [False, False, True] + 2 * [False, False]
     assert not any(tracker.labels)
+
+
+def test_the_declared_symmetry_has_rows_of_its_own(tmp_path):
+    """The second reading of a laptop's truth is wrong by far, and perfect up to symmetry."""
+    dataset = write_videos(tmp_path / "laptop.h5", category=LAPTOP)
+    source = videos.Videos(LAPTOP, dataset, dataset.videos, "two videos")
+    tracks = []
+    for name in dataset.videos:
+        truths = [frame.truth for frame in source.frames(name)]
+        truth = jax.tree.map(lambda *rows: np.stack(rows), *truths)
+        (equivalence,) = LAPTOP.equivalences
+        tracks.append(track(name, truth, second_reading(truth, equivalence, LAPTOP)))
+    found = runs.summarise(tracks, source, runs.Condition())
+    assert found["frames"] == 6 and found["mean_diagonal_m"] > 0
+    rows = comparison.rows("laptop", "given", found, TABLES["table6"].categories["laptop"])
+    assert [row[2] for row in rows] == 2 * ["given"] + 2 * ["given, up to symmetry"]
+    assert float(rows[0][4]) > 10
+    for row in rows[2:]:
+        assert row[4] == row[8] == "0.00" and row[11:] == ["100.0", "100.0"]
 
 
 def test_categories_without_model_or_data_are_named_and_not_invented(tmp_path, capsys, monkeypatch):

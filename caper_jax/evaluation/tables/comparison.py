@@ -28,41 +28,53 @@ COLUMNS = (
     "oriented boxes in the camera's frame",
     "means over all frames of all videos but the first of each; a lost frame counts with the pose "
     "that was held",
+    "up to symmetry: against the better of the readings that the category declares equally right, "
+    "frame by frame",
 )
 
 
-def rows(category: str, label: str, summary: dict[str, Any], paper: Figures | None):
-    """One row per part.
+def rows(
+    category: str, label: str, summary: dict[str, Any], paper: Figures | None
+) -> list[list[str]]:
+    """One row per part, and another where the category has a declared symmetry.
 
     Args:
       category: its name.
       label: of the condition.
-      summary: from ``summarise_tracks``.
+      summary: from ``runs.summarise``.
       paper: figures to stand beside; None where the paper has none.
     """
+    table = _part_rows(category, label, summary["parts"], paper)
+    if "up_to_symmetry" in summary:
+        symmetric = summary["up_to_symmetry"]["parts"]
+        table += _part_rows(category, f"{label}, up to symmetry", symmetric, paper)
+    return table
+
+
+def _part_rows(
+    category: str, label: str, parts: list[dict[str, Any]], paper: Figures | None
+) -> list[list[str]]:
     table = []
-    for index, part in enumerate(summary["parts"]):
-        turn, shift, shown = part["rotation_deg"]["mean"], part["translation_relative"]["mean"], {}
+    for index, part in enumerate(parts):
+        turn, shift = part["rotation_deg"]["mean"], part["translation_relative"]["mean"]
+        cells: list[float | None] = [None] * 4
         if paper is not None:
             other = paper.beside(index)
-            shown = {
-                "turn": paper.rotation_deg[other],
-                "metres": paper.translation_m[other],
-                "shift": paper.translation_relative()[other],
-                "iou": paper.iou[other] if paper.iou else None,
-            }
-        relative = shown.get("shift")
+            cells = [
+                paper.rotation_deg[other],
+                paper.translation_m[other],
+                paper.translation_relative()[other],
+                paper.iou[other] if paper.iou else None,
+            ]
+        paper_turn, metres, relative, iou = cells
         table.append(
             [
                 *(category, part["name"], label),
-                number(shown.get("turn"), 2),
-                number(turn, 2),
-                number(ratio(turn, shown.get("turn")), 2),
-                number(shown.get("metres"), 3),
+                *(number(paper_turn, 2), number(turn, 2), number(ratio(turn, paper_turn), 2)),
+                number(metres, 3),
                 number(None if relative is None else 100 * relative, 2),
-                number(100 * shift, 2),
-                number(ratio(shift, relative), 2),
-                number(shown.get("iou"), 1),
+                *(number(100 * shift, 2), number(ratio(shift, relative), 2)),
+                number(iou, 1),
                 number(100 * part["iou_size"]["mean"], 1),
                 number(100 * part["iou_full"]["mean"], 1),
             ]
@@ -70,7 +82,9 @@ def rows(category: str, label: str, summary: dict[str, Any], paper: Figures | No
     return table
 
 
-def paper_rows(category: str, parts: tuple[str, ...], paper: Figures, reason: str):
+def paper_rows(
+    category: str, parts: tuple[str, ...], paper: Figures, reason: str
+) -> list[list[str]]:
     """The paper's figures where there is nothing of ours, for a reason such as "no model"."""
     table = []
     for index, part in enumerate(parts):

@@ -13,6 +13,8 @@ from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load, shipped_weights
+from caper_jax.evaluation.metrics import PART_METRICS, PoseErrors, pose_errors_up_to_symmetry
+from caper_jax.evaluation.report import summary
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.videos import Videos, dataset_videos, generated_videos
 from caper_jax.evaluation.tracking import (
@@ -166,14 +168,40 @@ def track_all(tracker: Tracker, videos: Videos, condition: Condition) -> list[Tr
 def summarise(tracks: Sequence[Track], videos: Videos, condition: Condition) -> dict[str, Any]:
     """Metrics of the tracks over all frames but the first, JSON-ready.
 
-    Besides those of ``summarise_tracks``: "mean_diagonal_m" of the objects shown.
+    Besides those of ``summarise_tracks``: "mean_diagonal_m" of the objects shown and, for a
+    category with declared equivalences, "up_to_symmetry" with the errors of the parts against the
+    better reading of the truth, frame by frame; "parts" never has them.
+
+    Args:
+      tracks: at least one; all with ground truth.
+      videos: what they went through.
+      condition: under which.
     """
-    summary = summarise_tracks(
-        tracks,
-        videos.category,
-        condition.start,
-        videos.dataset.mask_source,
-        condition.part_masks,
-    )
-    diagonals = [object_diagonal(track.truth) for track in tracks if track.truth is not None]
-    return {**summary, "mean_diagonal_m": float(np.concatenate(diagonals).mean())}
+    category, mask_source = videos.category, videos.dataset.mask_source
+    arguments = (category, condition.start, mask_source, condition.part_masks)
+    found = summarise_tracks(tracks, *arguments)
+    pairs = [(track.pose, track.truth) for track in tracks if track.truth is not None]
+    diagonals = [object_diagonal(truth) for _, truth in pairs]
+    found["mean_diagonal_m"] = float(np.concatenate(diagonals).mean())
+    if category.equivalences:
+        errors = [pose_errors_up_to_symmetry(pose, truth, category) for pose, truth in pairs]
+        relative = [e.translation_m / d[:, None] for e, d in zip(errors, diagonals, strict=True)]
+        found["up_to_symmetry"] = {
+            "reasons": [equivalence.reason for equivalence in category.equivalences],
+            "parts": _part_means(errors, relative, category),
+        }
+    return found
+
+
+def _part_means(
+    errors: Sequence[PoseErrors], relative: Sequence[np.ndarray], category: Category
+) -> list[dict[str, Any]]:
+    """Mean and median of the parts' errors over the videos, each without its first frame."""
+    values = {
+        key: np.concatenate([getattr(error, key)[1:] for error in errors]) for key in PART_METRICS
+    }
+    values["translation_relative"] = np.concatenate([share[1:] for share in relative])
+    return [
+        {"name": part, **{key: summary(value[:, k]) for key, value in values.items()}}
+        for k, part in enumerate(category.parts)
+    ]
