@@ -9,6 +9,7 @@ import types
 from functools import partial
 from pathlib import Path
 
+import formats
 import jax
 import numpy as np
 import pytest
@@ -258,6 +259,19 @@ def test_generated_videos_are_drawn_once(tmp_path, monkeypatch):
     assert [path.name for path in drawn] == names
 
 
+def test_videos_of_a_public_layout_and_frames_that_are_none(tmp_path):
+    (tmp_path / "pm").mkdir()
+    root = formats.write_root("pm-videos", tmp_path / "pm")
+    found = videos.dataset_videos("pm-videos", root, LAPTOP, None, 1)
+    ((name, index),) = found.index.items()
+    assert [frame.name for frame in found.frames(name)] == [found.dataset.names[i] for i in index]
+    assert all(frame.startswith(name) for frame in map(found.dataset.names.__getitem__, index))
+    assert videos.dataset_videos("pm-videos", root, BOX, None, None) is None
+    single = formats.write_root("caper", tmp_path)
+    with pytest.raises(CaperError, match="holds single frames, no videos, of box"):
+        videos.dataset_videos("caper", single, BOX, None, None)
+
+
 class TestKeyframes:
     def test_only_without_keyframes_nothing_comes_to_the_rescue(self):
         options = Options(out=Path("out"), network_alone=True)
@@ -398,6 +412,11 @@ class TestIncrements:
     [
         (["table4", "--category", "laptop"], "unknown category of this table 'laptop'"),
         (["table4", "--category", "box", "--data", "x"], "--data needs --format"),
+        (["table4", "--category", "box", "--split", "train"], "--split goes with --data"),
+        (
+            ["table4", "--category", "box", "--data", "x", "--format", "caper", "--mode", "cam"],
+            "--mode is of generated videos",
+        ),
         (["jitter", "--category", "box", "--frames", "2"], "--frames must be 3 or more"),
         (["jitter", "--category", "boxx"], "did you mean 'box'?"),
         (["table9", "--steps", "3", "--minutes", "2"], "--steps and --minutes exclude each other"),

@@ -68,7 +68,7 @@ REPRODUCTIONS = {
 OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "category": (
         "--category",
-        {"action": "append", "default": [], "help": "may be repeated (default: all there are)"},
+        {"action": "append", "default": [], "help": "may be repeated (default: all of the table)"},
     ),
     "videos": (
         "--videos",
@@ -89,9 +89,8 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "mode": (
         "--mode",
         {
-            "default": "paper",
             "choices": ("paper", "cam", "hard"),
-            "help": "how generated videos move (default: %(default)s)",
+            "help": "how generated videos move (default: paper)",
         },
     ),
     "data": (
@@ -99,7 +98,7 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
         {"type": Path, "metavar": "ROOT", "help": "measure on a data set instead"},
     ),
     "format": ("--format", {"help": "layout of --data, as for caper evaluate"}),
-    "split": ("--split", {"default": "test", "help": "of --data (default: %(default)s)"}),
+    "split": ("--split", {"help": "of --data (default: test)"}),
     "weights": (
         "--weights",
         {

@@ -46,9 +46,7 @@ def run(name: str, options: Options) -> Report:
     facts, result = [], {}
     chosen = options.chosen(paper.variants["lie"])
     for key in chosen:
-        source = runs.open_videos(
-            options, categories.get(key), options.mode, paper.videos, paper.frames
-        )
+        source = runs.open_videos(options, categories.get(key), paper.videos, paper.frames)
         if source is None:
             facts.append(f"{key}: {runs.NO_DATA}")
             continue

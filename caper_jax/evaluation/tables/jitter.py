@@ -42,7 +42,7 @@ def run(name: str, options: Options) -> Report:
     models = runs.need_models(options.category, options.weights)
     rows, facts, result = [], [], {}
     for key, estimator in models.items():
-        videos = runs.open_videos(options, estimator.category, MODE, VIDEOS, FRAMES)
+        videos = runs.open_videos(options, estimator.category, VIDEOS, FRAMES, MODE)
         assert videos is not None  # generated ones exist for every category
         facts.append(f"{key}: {videos.description}")
         truths = [_truths(videos, video) for video in videos.index]

@@ -94,7 +94,7 @@ def _measure(name: str, options: Options, videos: int, frames: int) -> dict[str,
     estimator = runs.find_model(name, options.weights)
     if estimator is None:
         return {"data": runs.NO_MODEL, "policies": {}}
-    source = runs.open_videos(options, estimator.category, options.mode, videos, frames)
+    source = runs.open_videos(options, estimator.category, videos, frames)
     if source is None:
         return {"data": runs.NO_DATA, "policies": {}}
     found, condition = {}, runs.Condition()

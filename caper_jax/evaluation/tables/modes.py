@@ -34,7 +34,7 @@ def run(name: str, options: Options) -> Report:
         tracker = Tracker(estimator, runs.tracker_config(options))
         found = {}
         for mode in MODES:
-            videos = runs.open_videos(options, estimator.category, mode, VIDEOS, FRAMES)
+            videos = runs.open_videos(options, estimator.category, VIDEOS, FRAMES, mode)
             assert videos is not None  # generated ones exist for every category
             tracks = runs.track_all(tracker, videos, condition)
             found[mode] = runs.summarise(tracks, videos, condition)

@@ -32,10 +32,10 @@ class Options:
     category: tuple[str, ...] = ()
     videos: int | None = None
     frames: int | None = None
-    mode: str = "paper"
+    mode: str | None = None
     data: Path | None = None
     format: str | None = None
-    split: str = "test"
+    split: str | None = None
     weights: Path | None = None
     seed: int = 0
     given_masks: bool = False

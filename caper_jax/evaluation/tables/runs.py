@@ -16,7 +16,7 @@ from caper_jax.estimator import Estimator, load, shipped_weights
 from caper_jax.evaluation.metrics import PART_METRICS, PoseErrors, pose_errors_up_to_symmetry
 from caper_jax.evaluation.report import summary
 from caper_jax.evaluation.tables.options import Options
-from caper_jax.evaluation.tables.videos import Videos, dataset_videos, generated_videos
+from caper_jax.evaluation.tables.videos import SPLIT, Videos, dataset_videos, generated_videos
 from caper_jax.evaluation.tracking import (
     Start,
     Track,
@@ -127,30 +127,38 @@ def _model_category(directory: Path) -> Any:
 
 
 def open_videos(
-    options: Options, category: Category, mode: str, videos: int, frames: int
+    options: Options, category: Category, videos: int, frames: int, mode: str = "paper"
 ) -> Videos | None:
     """The videos to measure on; None where the data set has none of this category.
 
     Args:
       options: name the data set, or how to generate.
       category: to show.
-      mode, videos, frames: of generated videos, as far as the options do not say otherwise.
+      videos, frames, mode: of generated videos, as far as the options do not say otherwise.
 
     Raises:
-      CaperError: see ``generated_videos`` and ``dataset_videos``.
+      CaperError: options that contradict each other; see ``generated_videos`` and
+        ``dataset_videos``.
     """
-    if options.data is not None:
-        if options.format is None:
-            raise CaperError("--data needs --format, the layout of the data")
-        return dataset_videos(options.format, options.data, category, options.split, options.videos)
-    return generated_videos(
-        options.out / "videos",
-        category,
-        mode,
-        options.videos or videos,
-        options.frames or frames,
-        options.seed,
-    )
+    if options.data is None:
+        for name in ("format", "split"):
+            if getattr(options, name) is not None:
+                raise CaperError(f"--{name} goes with --data")
+        return generated_videos(
+            options.out / "videos",
+            category,
+            options.mode or mode,
+            options.videos or videos,
+            options.frames or frames,
+            options.seed,
+        )
+    for name in ("mode", "frames"):
+        if getattr(options, name) is not None:
+            raise CaperError(f"--{name} is of generated videos; leave out --data or --{name}")
+    if options.format is None:
+        raise CaperError("--data needs --format, the layout of the data")
+    split = options.split or SPLIT
+    return dataset_videos(options.format, options.data, category, split, options.videos)
 
 
 def track_all(tracker: Tracker, videos: Videos, condition: Condition) -> list[Track]:

@@ -65,7 +65,7 @@ def _measure(name: str, options: Options, videos: int, frames: int) -> dict[str,
     estimator = runs.find_model(name, options.weights)
     if estimator is None:
         return {"missing": runs.NO_MODEL, "runs": []}
-    source = runs.open_videos(options, estimator.category, options.mode, videos, frames)
+    source = runs.open_videos(options, estimator.category, videos, frames)
     if source is None:
         return {"missing": runs.NO_DATA, "runs": []}
     tracker = Tracker(estimator, runs.tracker_config(options))
