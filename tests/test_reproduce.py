@@ -243,6 +243,7 @@ def test_generated_videos_are_drawn_once(tmp_path, monkeypatch):
     first = draw()
     assert list(first.index.values()) == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]]
     assert first.dataset.split == "test" and first.dataset.attributes["mode"] == "still"
+    assert "3 generated videos of 4 frames, mode still (camera and root" in first.description
     states = [frame.truth.joint_state[0] for frame in first.frames("00001")]
     assert np.ptp(states) == 0
     drawn = []

@@ -16,7 +16,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.data import categories_in, hdf5, open_dataset
 from caper_jax.data.schema import Dataset, Frame
 from caper_jax.data.synthetic.config import GeneratorConfig
-from caper_jax.data.synthetic.videos import VideoGenerator
+from caper_jax.data.synthetic.videos import MODES, VideoGenerator
 from caper_jax.errors import CaperError
 from caper_jax.progress import progress
 
@@ -87,11 +87,14 @@ def generated_videos(
         folder.mkdir(parents=True, exist_ok=True)
         _draw(path, generator, videos, seed, wanted)
         kept = hdf5.Hdf5Dataset(path, category.name, SPLIT)
+    # A given first pose of a root that never moves stays right by itself: readers must know.
+    stands = " (camera and root stand still)" if MODES[mode].camera_speed == 0 else ""
     return Videos(
         category,
         kept,
         kept.videos,
-        f"{videos} generated videos of {frames} frames, mode {mode}, noise {noise}, seed {seed}, "
+        f"{videos} generated videos of {frames} frames, mode {mode}{stands}, noise {noise}, "
+        f"seed {seed}, "
         "of test instances, which training never shows",
     )
 
