@@ -18,20 +18,22 @@ class TrackerConfig:
 
     Attributes:
       policy: when a frame becomes the keyframe that increments refer to (Sec 5.3.2, Alg 1).
-        "dynamic": when the energy exceeds ``threshold``; its pose then comes from the static
-        estimator. "fixed": every ``interval`` frames, likewise. "none": every frame, with the
-        tracked pose, so that errors add up. "promote": like "dynamic", but with the tracked pose
-        (errata: the reading of Algorithm 1's l. 8 in the code it goes back to); the static
-        estimator only helps where the track is lost.
+        "dynamic": when the energy exceeds ``threshold`` or the share of unmatched points
+        ``unseen``; its pose then comes from the static estimator. "fixed": every ``interval``
+        frames, likewise. "none": every frame, with the tracked pose, so that errors add up.
+        "promote": like "dynamic", but with the tracked pose (errata: the reading of Algorithm 1's
+        l. 8 in the code it goes back to); the static estimator only helps where the track is lost.
       interval: of "fixed", in frames.
       threshold: phi of Eq 16, relative to the object's diagonal.
+      unseen: share of points off the surface seen so far that asks for a new keyframe.
       filtered: weigh the static estimator's pose at a keyframe against the tracked one by their
         variances; off, the keyframe takes the estimator's as it is (the paper's text).
       anchored: let the network see the cloud canonicalised by the predicted pose, a step on from
         the keyframe's, instead of the keyframe's own; the increment is the same, but small.
       registration: of the cloud to the keyframe's; ``registration.steps = 0`` leaves the network's
         increment alone (the paper's tracker).
-      damping: how much of the last velocity the prediction keeps.
+      damping: how much of the velocity is kept from frame to frame.
+      velocity_gain: how much of what the prediction missed goes into the velocity.
       gate_deg, gate: rotation and distance (network units) beyond which a static estimate or the
         network contradicts the track, not only differs from it.
       patience: frames in a row that contradict before the track is called lost.
@@ -44,10 +46,12 @@ class TrackerConfig:
     policy: Policy = "dynamic"
     interval: int = 10
     threshold: float = 0.03
+    unseen: float = 0.12
     filtered: bool = True
     anchored: bool = True
     registration: RegistrationConfig = RegistrationConfig()
     damping: float = 0.8
+    velocity_gain: float = 1.0
     gate_deg: float = 30.0
     gate: float = 0.4
     patience: int = 3

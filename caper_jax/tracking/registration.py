@@ -1,11 +1,12 @@
-"""Registration of a cloud to a keyframe's surface, on the kinematic tree.
+"""Registration of a cloud to the surface seen so far, on the kinematic tree.
 
-Beyond the paper: its network says in one pass how far the object moved since the keyframe, and is
-right to a degree or two; the two clouds together say it to a tenth of that. The keyframe's cloud
-becomes a few Gaussians (local mean and covariance, so that its noise averages out and its normals
-need no search), every point of the new cloud is matched with the nearest one of its part, and
-Gauss-Newton steps on the root's twist and the joint states minimise the robust Mahalanobis
-distances. All of it is differentiable but the choice of matches.
+Beyond the paper: its network says in one pass how far the object moved, and is right to a degree
+or two; the clouds themselves say it to a tenth of that. The clouds of keyframes become a few
+hundred Gaussians (local mean and covariance, so that noise averages out and normals need no
+search), each in the frame of its part; a later keyframe adds only what was not seen before, so that
+what was seen first stays where it was. Every point of a new cloud is matched with the nearest
+Gaussian, and Gauss-Newton steps on the root's twist and the joint states minimise the robust
+Mahalanobis distances. All of it is differentiable but the choice of matches.
 
 Lengths are network units; a joint's state is radians or network units.
 """
@@ -13,7 +14,7 @@ Lengths are network units; a joint's state is radians or network units.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import flax.struct
@@ -25,6 +26,8 @@ from caper_jax.articulation.joints import joint_transforms
 from caper_jax.geometry import linalg, se3
 from caper_jax.networks.graph import gather, squared_distances
 
+_NOWHERE = 1e3  # where Gaussians lie that are none
+
 
 @dataclass(frozen=True)
 class RegistrationConfig:
@@ -32,7 +35,9 @@ class RegistrationConfig:
 
     Attributes:
       steps: Gauss-Newton steps per frame, each with new matches; 0 leaves the network's increment.
-      gaussians: number of Gaussians of a keyframe.
+      gaussians: number of Gaussians of one keyframe.
+      capacity: largest number of Gaussians kept; the oldest give way.
+      stride: every so-manieth point of a cloud is registered.
       window: standard deviation of the window around each of them.
       noise: standard deviation added to their covariance: sensor and shape.
       robust: Mahalanobis distance at which a match counts a quarter.
@@ -47,6 +52,8 @@ class RegistrationConfig:
 
     steps: int = 3
     gaussians: int = 256
+    capacity: int = 512
+    stride: int = 1
     window: float = 0.08
     noise: float = 0.01
     robust: float = 3.0
@@ -63,17 +70,19 @@ class RegistrationConfig:
 
 @flax.struct.dataclass
 class Surface:
-    """Gaussians of a keyframe's cloud, in its proxy canonical space (Eq 9).
+    """Gaussians on the parts' surfaces, each in the frame of its part.
 
     Attributes:
-      mean: [M, 3].
-      information: [M, 3, 3] inverse covariances.
+      mean: [M, 3]; far away where there is none yet.
+      information: [M, 3, 3] inverse covariances, across the surface only.
       labels: [M] int32 part of each.
+      added: [] int32, how many were ever added; the next one takes the place ``added`` modulo M.
     """
 
     mean: Any
     information: Any
     labels: Any
+    added: Any
 
 
 @flax.struct.dataclass
@@ -92,11 +101,52 @@ class Tree:
     parents: tuple[int, ...] = flax.struct.field(pytree_node=False)
 
 
-def make_surface(points, labels, config: RegistrationConfig) -> Surface:
-    """The Gaussians of a cloud.
+@flax.struct.dataclass
+class PartPoses:
+    """Part poses as functions of the joint states, exact at the keyframe.
+
+    Attributes:
+      tree: joints.
+      state: [J] of the keyframe.
+      poses: [K, 4, 4] part poses in the root's frame there.
+    """
+
+    tree: Tree
+    state: Any
+    poses: Any
+
+    def at(self, state):
+        """[K, 4, 4] poses at joint states [J]: the keyframe's, moved by the joints (Eq 8)."""
+        before, after = part_poses(self.tree, self.state), part_poses(self.tree, state)
+        return se3.compose(se3.compose(after, se3.inverse(before)), self.poses)
+
+
+def part_poses(tree: Tree, state):
+    """[K, 4, 4] poses of the parts in the root's frame."""
+    moves = joint_transforms(tree.types, tree.axis, tree.pivot, state)
+    poses = [jnp.eye(4, dtype=moves.dtype)]
+    for joint, parent in enumerate(tree.parents):
+        poses.append(se3.compose(poses[parent], moves[joint]))
+    return jnp.stack(poses)
+
+
+def empty_surface(config: RegistrationConfig) -> Surface:
+    """No Gaussians."""
+    size = config.capacity
+    return Surface(
+        mean=jnp.full((size, 3), _NOWHERE),
+        information=jnp.tile(jnp.eye(3), (size, 1, 1)),
+        labels=jnp.zeros(size, jnp.int32),
+        added=jnp.asarray(0, jnp.int32),
+    )
+
+
+def extend_surface(surface: Surface, points, labels, config: RegistrationConfig) -> Surface:
+    """A surface with what a cloud shows of it for the first time.
 
     Args:
-      points: [N, 3] proxy canonical space.
+      surface: so far.
+      points: [N, 3] each in the frame of its part.
       labels: [N] int32.
       config: sizes.
     """
@@ -112,32 +162,45 @@ def make_surface(points, labels, config: RegistrationConfig) -> Surface:
     second = moments[:, 3:][:, np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])]
     covariance = second - mean[:, :, None] * mean[:, None, :]
     covariance += config.noise**2 * jnp.eye(3, dtype=points.dtype)
-    return Surface(mean, _inverse(covariance), kinds)
+
+    known = squared_distances(mean[None], surface.mean[None])[0]
+    known = jnp.where(kinds[:, None] == surface.labels, known, jnp.inf).min(-1)
+    new = known > config.window**2
+    rank = jnp.cumsum(new) - 1
+    at = jnp.where(new, (surface.added + rank) % config.capacity, config.capacity)
+    return Surface(
+        mean=surface.mean.at[at].set(mean, mode="drop"),
+        information=surface.information.at[at].set(_across(_inverse(covariance)), mode="drop"),
+        labels=surface.labels.at[at].set(kinds, mode="drop"),
+        added=surface.added + new.sum(dtype=jnp.int32),
+    )
 
 
-def part_motions(tree: Tree, before, after):
-    """[K, 4, 4] motion of every part in the root's frame, between two joint states [J]."""
-    old = part_poses(tree, before)
-    new = part_poses(tree, after)
-    return se3.compose(new, se3.inverse(old))
+def move_surface(surface: Surface, motions) -> Surface:
+    """The surface after a change of the parts' frames: [K, 4, 4], old frame -> new frame."""
+    motion = motions[surface.labels]
+    turn = motion[:, :3, :3]
+    information = linalg.multiply(
+        linalg.multiply(turn, surface.information), linalg.transpose(turn)
+    )
+    mean = se3.act(motion, surface.mean[:, None])[:, 0]
+    return replace(surface, mean=mean, information=information)
 
 
 def register(
     surface: Surface,
-    surface_state,
-    tree: Tree,
+    parts: PartPoses,
     points,
     labels,
     start,
     expected,
     config: RegistrationConfig,
 ):
-    """Root pose and joint states at which a cloud lies on the keyframe's surface.
+    """Root pose and joint states at which a cloud lies on the surface.
 
     Args:
-      surface: of the keyframe.
-      surface_state: [J] joint states in it.
-      tree: joints.
+      surface: seen so far.
+      parts: gives the part poses at any joint states.
       points: [N, 3] camera frame.
       labels: [N] int32 parts.
       start: (root pose [4, 4], joint states [J]) where the search starts.
@@ -153,7 +216,7 @@ def register(
     information = jnp.zeros((6 + joints, 6 + joints))
     for _ in range(config.steps):
         residual, jacobian, weight, matrix = _linearise(
-            surface, surface_state, tree, points, labels, root, state, config
+            surface, parts, points, labels, root, state, config
         )
         weighted = jnp.einsum("nab,nbd->nad", matrix, jacobian, precision="highest")
         weighted *= weight[:, None, None]
@@ -194,31 +257,27 @@ def hold_still(before, root, information, threshold: float):
     return se3.compose(before, se3.exp(share * xi))
 
 
-def mismatch(
-    surface: Surface, surface_state, tree: Tree, points, labels, pose, config: RegistrationConfig
-):
-    """Mean robust distance [] of a cloud from the keyframe's surface, in [0, 1]: 1 is no match.
+def mismatch(surface: Surface, parts: PartPoses, points, labels, pose, config: RegistrationConfig):
+    """Mean robust distance [] of a cloud from the surface, in [0, 1]: 1 is no match.
 
     Args as for ``register``; ``pose`` is (root [4, 4], joint states [J]).
     """
     root, state = pose
-    residual, matrix, _, _ = _residuals(
-        surface, surface_state, tree, points, labels, root, state, config
-    )
+    residual, matrix, _, _ = _residuals(surface, parts, points, labels, root, state, config)
     squared = (residual * linalg.apply(matrix, residual)).sum(-1)
     ratio = squared / config.robust**2
     return (ratio / (1.0 + ratio)).mean()
 
 
-def _residuals(surface, surface_state, tree, points, labels, root, state, config):
+def _residuals(surface, parts, points, labels, root, state, config):
     """(residual [N, 3], information [N, 3, 3], points [N, 3], all in the root's frame; matches)."""
-    motions = part_motions(tree, surface_state, state)
+    poses = parts.at(state)
     here = se3.act(se3.inverse(root), points)
-    mean = se3.act(motions[surface.labels], surface.mean[:, None])[:, 0]
+    mean = se3.act(poses[surface.labels], surface.mean[:, None])[:, 0]
     squared = squared_distances(here[None], mean[None])[0]
     squared += jnp.where(labels[:, None] == surface.labels, 0.0, config.wrong_part**2)
     at = jax.lax.stop_gradient(squared).argmin(-1)
-    turn = motions[surface.labels[at]][:, :3, :3]
+    turn = poses[surface.labels[at]][:, :3, :3]
     matrix = linalg.multiply(
         linalg.multiply(turn, gather(surface.information[None], at[None])[0]),
         linalg.transpose(turn),
@@ -227,11 +286,9 @@ def _residuals(surface, surface_state, tree, points, labels, root, state, config
     return residual, matrix, here, at
 
 
-def _linearise(surface, surface_state, tree, points, labels, root, state, config):
+def _linearise(surface, parts, points, labels, root, state, config):
     """Residuals [N, 3], their Jacobian [N, 3, 6 + J], robust weights [N], information."""
-    residual, matrix, here, at = _residuals(
-        surface, surface_state, tree, points, labels, root, state, config
-    )
+    residual, matrix, here, at = _residuals(surface, parts, points, labels, root, state, config)
     squared = (residual * linalg.apply(matrix, residual)).sum(-1)
     weight = config.share / (1.0 + squared / config.robust**2) ** 2
     # root -> root exp(xi) moves a point in the root's frame by -(w x p + rho).
@@ -239,6 +296,7 @@ def _linearise(surface, surface_state, tree, points, labels, root, state, config
     x, y, z = here.T
     turn = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
     columns = [turn, -jnp.broadcast_to(jnp.eye(3, dtype=here.dtype), turn.shape)]
+    tree = parts.tree
     axis, pivot = _moved_joints(tree, state)
     carried = jnp.asarray(_carried(tree.parents), here.dtype)
     target = here - residual
@@ -252,15 +310,6 @@ def _linearise(surface, surface_state, tree, points, labels, root, state, config
         moves = carried[joint][surface.labels[at]]
         columns.append(-(motion * moves[:, None])[..., None])
     return residual, jnp.concatenate(columns, -1), weight, matrix
-
-
-def part_poses(tree: Tree, state):
-    """[K, 4, 4] poses of the parts in the root's frame."""
-    moves = joint_transforms(tree.types, tree.axis, tree.pivot, state)
-    poses = [jnp.eye(4, dtype=moves.dtype)]
-    for joint, parent in enumerate(tree.parents):
-        poses.append(se3.compose(poses[parent], moves[joint]))
-    return jnp.stack(poses)
 
 
 def _moved_joints(tree: Tree, state):
@@ -280,6 +329,17 @@ def _carried(parents: Sequence[int]) -> np.ndarray:
             carried[part - 1, child] = 1.0
             part = parents[part - 1]
     return carried
+
+
+def _across(information):
+    """Information [..., 3, 3] across the surface only.
+
+    Along it a Gaussian is as wide as its window, which says nothing about where a point should
+    lie; yet on a link that turns under the camera many small pulls would hold it back. The square
+    over the trace keeps the largest eigenvalue and all but removes the others.
+    """
+    trace = jnp.trace(information, axis1=-2, axis2=-1)[..., None, None]
+    return linalg.multiply(information, information) / trace
 
 
 def _inverse(matrix):

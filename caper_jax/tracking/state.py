@@ -53,7 +53,6 @@ class Keyframe:
       parts: [K, 4, 4] pose of each part in the root's frame.
       points: [N, 3] its cloud in its proxy canonical space (Eq 9).
       labels: [N] int32 parts of the points.
-      surface: the same cloud, for registration.
       age: [] int32, frames since.
     """
 
@@ -62,7 +61,6 @@ class Keyframe:
     parts: Any
     points: Any
     labels: Any
-    surface: Surface
     age: Any
 
 
@@ -80,6 +78,7 @@ class TrackerState:
       variance: [3] of root rotation, root translation and joint states, as far as they have
         drifted from what the static estimator or the user gave.
       keyframe: what increments refer to.
+      surface: what was seen of the parts so far, for registration.
       doubtful: [] int32, frames in a row that disagreed with the track.
       lost: [] bool, the next frame with points starts afresh from the static estimator.
     """
@@ -92,5 +91,6 @@ class TrackerState:
     constants: Constants
     variance: Any
     keyframe: Keyframe
+    surface: Surface
     doubtful: Any
     lost: Any

@@ -21,13 +21,15 @@ from caper_jax.tracking.config import TrackerConfig
 from caper_jax.tracking.energy import chamfer_energy
 from caper_jax.tracking.joints import joints_from_poses
 from caper_jax.tracking.registration import (
+    PartPoses,
     RegistrationConfig,
     Surface,
     Tree,
+    empty_surface,
+    extend_surface,
     hold_still,
-    make_surface,
     mismatch,
-    part_motions,
+    move_surface,
     part_poses,
     register,
 )
@@ -81,18 +83,12 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
         seen=jnp.asarray(0.0),
         known=jnp.zeros(joints),
     )
-    gaussians = config.registration.gaussians
     keyframe = Keyframe(
         root=eye,
         joint_state=jnp.zeros(joints),
         parts=jnp.tile(eye, (parts, 1, 1)),
         points=jnp.zeros((points, 3)),
         labels=jnp.zeros(points, jnp.int32),
-        surface=Surface(
-            jnp.zeros((gaussians, 3)),
-            jnp.tile(jnp.eye(3), (gaussians, 1, 1)),
-            jnp.zeros(gaussians, jnp.int32),
-        ),
         age=jnp.asarray(0, jnp.int32),
     )
     return TrackerState(
@@ -104,6 +100,7 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
         constants=constants,
         variance=jnp.zeros(3),
         keyframe=keyframe,
+        surface=empty_surface(config.registration),
         doubtful=jnp.asarray(0, jnp.int32),
         lost=jnp.asarray(True),
     )
@@ -136,13 +133,15 @@ def given_state(
     found = _measure(variables, points, frame.labels, root, category, network)
     states, constants = joints_from_poses(parts, found.constants, category)
     fix = replace(found, root=root, parts=parts, joint_state=states, constants=constants)
+    begin = initial_state(category, network, config)
     return replace(
-        initial_state(category, network, config),
+        begin,
         root=root,
         joint_state=fix.joint_state,
         parts=parts,
         constants=fix.constants,
-        keyframe=_make_keyframe(fix, points, config),
+        keyframe=_make_keyframe(fix, points),
+        surface=_extended(begin.surface, fix, points, config),
         lost=jnp.asarray(False),
     )
 
@@ -185,14 +184,15 @@ def track_step(
     tree = Tree(constants.axis, constants.pivot, category.joint_types, category.parents)
 
     root, joints = found.root, found.joint_state
-    against = (key.surface, key.joint_state, tree, points, found.labels)
+    parts = PartPoses(tree, key.joint_state, key.parts)
+    stride = config.registration.stride
+    against = (state.surface, parts, points[::stride], found.labels[::stride])
     if config.registration.steps:
         start = _better_start(against, predicted, (root, joints), config)
         expected = _expectations(config.registration, predicted, (root, joints))
         root, joints, information = register(*against, start, expected, config.registration)
         root = hold_still(state.root, root, information, config.registration.hold)
-    motions = part_motions(tree, key.joint_state, joints)
-    tracked = _Fix(root, joints, se3.compose(motions, key.parts), found.labels, constants)
+    tracked = _Fix(root, joints, parts.at(joints), found.labels, constants)
 
     unmatched = mismatch(*against, (root, joints), config.registration)
     contradicted = (unmatched > config.mismatch) | _apart(root, found.root, config)
@@ -201,28 +201,46 @@ def track_step(
     energy = chamfer_energy(
         se3.act(se3.inverse(root), points)[::_ENERGY_STRIDE],
         found.labels[::_ENERGY_STRIDE],
-        se3.act(motions[key.labels], key.points[:, None])[::_ENERGY_STRIDE, 0],
+        _moved(key, tracked)[::_ENERGY_STRIDE],
         key.labels[::_ENERGY_STRIDE],
         category.num_parts,
         _diagonal(constants),
     )
-    due = _due(energy, key.age, config) | lost
+    due = _due(energy, unmatched, key.age, config) | lost
     fix, variance, estimated = _keyframe_fix(
-        variables, points, tracked, state.variance, due, lost, category, network, config
+        variables,
+        points,
+        frame.labels,
+        tracked,
+        state.variance,
+        due,
+        lost,
+        category,
+        network,
+        config,
     )
-    made = _make_keyframe(fix, points, config)
+    made = _make_keyframe(fix, points)
     kept = replace(key, age=key.age + 1)
+    surface = jax.lax.cond(
+        due,
+        lambda: _extended(_rebased(state.surface, tracked, fix, lost, config), fix, points, config),
+        lambda: state.surface,
+    )
 
-    velocity = se3.log(se3.compose(se3.inverse(state.root), fix.root))
+    missed = se3.log(se3.compose(se3.inverse(predicted[0]), fix.root))
+    velocity = config.damping * state.root_velocity + config.velocity_gain * missed
+    joint_velocity = config.damping * state.joint_velocity
+    joint_velocity += config.velocity_gain * (fix.joint_state - predicted[1])
     after = TrackerState(
         root=fix.root,
         joint_state=fix.joint_state,
         parts=fix.parts,
         root_velocity=jnp.where(lost, 0.0, velocity),
-        joint_velocity=jnp.where(lost, 0.0, fix.joint_state - state.joint_state),
+        joint_velocity=jnp.where(lost, 0.0, joint_velocity),
         constants=fix.constants,
         variance=variance,
         keyframe=_where(due, made, kept),
+        surface=surface,
         # A pose from the static estimator alone is on trial: one contradiction undoes it.
         doubtful=jnp.where(lost, config.patience - 1, doubtful),
         lost=jnp.asarray(False),
@@ -320,7 +338,7 @@ def _expectations(config: RegistrationConfig, predicted, found):
 
 
 def _better_start(
-    against: tuple[Surface, Any, Tree, Any, Any], predicted, found, config: TrackerConfig
+    against: tuple[Surface, PartPoses, Any, Any], predicted, found, config: TrackerConfig
 ):
     """The prediction or the network's answer, whichever lies closer to the keyframe's surface."""
     costs = [mismatch(*against, start, config.registration) for start in (predicted, found)]
@@ -334,21 +352,23 @@ def _apart(first, second, config: TrackerConfig):
     return (turn > jnp.radians(config.gate_deg)) | (shift > config.gate)
 
 
-def _due(energy, age, config: TrackerConfig):
+def _due(energy, unmatched, age, config: TrackerConfig):
     """Whether the policy wants a new keyframe."""
     if config.policy == "none":
         return jnp.asarray(True)
     if config.policy == "fixed":
         return age + 1 >= config.interval
-    return energy > config.threshold
+    return (energy > config.threshold) | (unmatched > config.unseen)
 
 
-def _keyframe_fix(variables, points, tracked: _Fix, variance, due, lost, category, network, config):
+def _keyframe_fix(
+    variables, points, labels, tracked: _Fix, variance, due, lost, category, network, config
+):
     """The pose of a frame that may be a keyframe, its variance [3], whether it was estimated."""
     asks = lost | due if config.policy in ("fixed", "dynamic") else lost
     static = jax.lax.cond(
         asks,
-        lambda: _estimate(variables, points, tracked.labels, category, network),
+        lambda: _estimate(variables, points, labels, category, network),
         lambda: tracked,
     )
     static_variance = jnp.square(
@@ -374,17 +394,37 @@ def _keyframe_fix(variables, points, tracked: _Fix, variance, due, lost, categor
     return fix, jnp.where(lost, static_variance, (1.0 - gain) * grown), asks
 
 
-def _make_keyframe(fix: _Fix, points, config: TrackerConfig) -> Keyframe:
-    cloud = se3.act(se3.inverse(fix.root), points)
+def _make_keyframe(fix: _Fix, points) -> Keyframe:
     return Keyframe(
         root=fix.root,
         joint_state=fix.joint_state,
         parts=fix.parts,
-        points=cloud,
+        points=se3.act(se3.inverse(fix.root), points),
         labels=fix.labels,
-        surface=make_surface(cloud, fix.labels, config.registration),
         age=jnp.asarray(0, jnp.int32),
     )
+
+
+def _moved(key: Keyframe, fix: _Fix):
+    """The keyframe's cloud [N, 3], each part moved by its increment, in the root's frame."""
+    motions = se3.compose(fix.parts, se3.inverse(key.parts))
+    return se3.act(motions[key.labels], key.points[:, None])[:, 0]
+
+
+def _extended(surface: Surface, fix: _Fix, points, config: TrackerConfig) -> Surface:
+    poses = se3.compose(fix.root, fix.parts)
+    own = se3.act(se3.inverse(poses)[fix.labels], points[:, None])[:, 0]
+    return extend_surface(surface, own, fix.labels, config.registration)
+
+
+def _rebased(surface: Surface, tracked: _Fix, fix: _Fix, lost, config: TrackerConfig) -> Surface:
+    """The surface where it was in the camera's frame, said in corrected part frames.
+
+    An estimate that replaces the track says that those frames meant nothing: nothing is kept.
+    """
+    old, new = (se3.compose(f.root, f.parts) for f in (tracked, fix))
+    moved = move_surface(surface, se3.compose(se3.inverse(new), old))
+    return _where(lost, empty_surface(config.registration), moved)
 
 
 def _diagonal(constants: Constants):
