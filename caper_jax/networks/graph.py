@@ -45,6 +45,22 @@ def nearest_row(query, points):
     return squared_distances(lax.stop_gradient(query), lax.stop_gradient(points)).argmin(-1)
 
 
+def smallest(squared):
+    """Index [...] of the smallest of squared distances [..., M]; no gradient passes.
+
+    Float32 ones are compared as integers that carry the index in their lowest bits: a minimum is
+    three times as fast as an argmin on a CPU. Distances that agree to 2^-13 may change places.
+    """
+    squared = lax.stop_gradient(squared)
+    size = squared.shape[-1]
+    bits = (size - 1).bit_length()
+    if squared.dtype != jnp.float32 or bits > 10:
+        return squared.argmin(-1)
+    mask = (1 << bits) - 1
+    packed = lax.bitcast_convert_type(squared, jnp.int32) & ~mask
+    return (packed | jnp.arange(size, dtype=jnp.int32)).min(-1) & mask
+
+
 def gather(features, index):
     """features [B, M, ...], index [B, ...] -> [B, ..., C] rows, per batch element."""
     return jax.vmap(lambda rows, at: rows.at[at].get(mode="promise_in_bounds"))(features, index)

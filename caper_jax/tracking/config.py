@@ -37,6 +37,8 @@ class TrackerConfig:
       gate_deg, gate: rotation and distance (network units) beyond which a static estimate or the
         network contradicts the track, not only differs from it.
       patience: frames in a row that contradict before the track is called lost.
+      misfit: mean distance of the points from their parts' boxes, relative to the object's
+        diagonal, above which a frame contradicts the track.
       mismatch: share of unmatched points above which a frame contradicts the track.
       static_rotation, static_translation, static_joint: standard deviations of the static
         estimator: radians, units, radians or units.
@@ -52,9 +54,10 @@ class TrackerConfig:
     registration: RegistrationConfig = RegistrationConfig()
     damping: float = 0.8
     velocity_gain: float = 1.0
-    gate_deg: float = 30.0
+    gate_deg: float = 15.0
     gate: float = 0.4
     patience: int = 3
+    misfit: float = 0.03
     mismatch: float = 0.5
     static_rotation: float = 0.1
     static_translation: float = 0.1

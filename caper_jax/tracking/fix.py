@@ -1,0 +1,134 @@
+"""Where the object is in one frame, as the networks see it: on the track, or from nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from caper_jax.articulation.category import Category
+from caper_jax.estimator import estimate
+from caper_jax.geometry import linalg, se3
+from caper_jax.networks.canonical import canonicalise
+from caper_jax.networks.caper import NetworkConfig, PartsNetwork
+from caper_jax.networks.increment import increment_transform
+from caper_jax.networks.voting import vote
+from caper_jax.tracking.registration import Tree, part_poses
+from caper_jax.tracking.state import Constants
+
+_MEMORY = 60.0  # frames over which joint parameters and sizes are averaged
+
+
+@flax.struct.dataclass
+class Fix:
+    """A pose of the object in one frame, from whatever source; network units.
+
+    Attributes:
+      root: [4, 4] root pose, camera frame.
+      joint_state: [J].
+      parts: [K, 4, 4] part poses in the root's frame.
+      labels: [N] int32 part of every point.
+      constants: joint parameters and sizes.
+    """
+
+    root: Any
+    joint_state: Any
+    parts: Any
+    labels: Any
+    constants: Constants
+
+
+def measure(
+    variables, points, labels, reference, category: Category, network: NetworkConfig
+) -> Fix:
+    """Stage II on the proxy-canonicalised cloud (Eq 9): increment from the reference, and the rest.
+
+    Args:
+      variables: as ``estimator.estimate`` takes them.
+      points: [N, 3] network units, camera frame.
+      labels: [N] int32, known parts of points, -1 where they are to be predicted.
+      reference: [4, 4] the root pose that canonicalises.
+      category, network: static.
+    """
+    own = {name: collection["parts"] for name, collection in variables.items()}
+    cloud = canonicalise(points[None], reference[None, :3, :3], reference[None, :3, 3])
+    module = PartsNetwork(network, category.num_parts)
+    output: Any = module.apply(own, cloud, train=False)
+    axis, pivot = vote(cloud, output.heatmap, output.offset, output.direction)
+    increment = increment_transform(output.increment[0], network.increment)
+    predicted = output.segmentation[0].argmax(-1).astype(jnp.int32)
+    unit = category.unit
+    constants = Constants(
+        axis=axis[0],
+        pivot=pivot[0],
+        size=jnp.asarray(category.mean_size) * unit + output.size[0],
+        center=jnp.asarray(category.mean_center) * unit + output.center[0],
+        seen=jnp.asarray(1.0),
+        known=jnp.zeros(category.num_joints),
+    )
+    tree = Tree(axis[0], pivot[0], category.joint_types, category.parents)
+    return Fix(
+        root=se3.compose(reference, increment),
+        joint_state=output.state[0],
+        parts=part_poses(tree, output.state[0]),
+        labels=jnp.where(labels >= 0, labels, predicted),
+        constants=constants,
+    )
+
+
+def estimate_fix(variables, points, labels, category: Category, network: NetworkConfig) -> Fix:
+    """The static estimator's answer; arguments as for ``measure``."""
+    unit = category.unit
+    prediction = estimate(variables, points[None] / unit, category, network)
+    pose = jax.tree.map(lambda array: array[0], prediction.pose)
+    length = jnp.array([unit if kind == "prismatic" else 1.0 for kind in category.joint_types])
+    poses = se3.from_rt(pose.rotation, pose.translation * unit)
+    return Fix(
+        root=poses[0],
+        joint_state=pose.joint_state * length,
+        parts=se3.compose(se3.inverse(poses[0]), poses),
+        labels=jnp.where(labels >= 0, labels, prediction.labels[0]),
+        constants=Constants(
+            axis=pose.joint_axis,
+            pivot=pose.joint_pivot * unit,
+            size=pose.size * unit,
+            center=pose.box_center * unit,
+            seen=jnp.asarray(1.0),
+            known=jnp.zeros(category.num_joints),
+        ),
+    )
+
+
+def averaged(old: Constants, new: Constants) -> Constants:
+    """Running means over the frames of a video."""
+    seen = jnp.minimum(old.seen, _MEMORY)
+    of_parts, of_joints = 1.0 / (seen + 1.0), 1.0 / (seen + old.known + 1.0)[:, None]
+    return Constants(
+        axis=linalg.unit(old.axis + of_joints * (new.axis - old.axis)),
+        pivot=old.pivot + of_joints * (new.pivot - old.pivot),
+        size=old.size + of_parts * (new.size - old.size),
+        center=old.center + of_parts * (new.center - old.center),
+        seen=old.seen + 1.0,
+        known=old.known,
+    )
+
+
+def diagonal(constants: Constants):
+    """[] length of the diagonal of the object's box at rest."""
+    half = jnp.abs(constants.size) / 2
+    low, high = (constants.center - half).min(0), (constants.center + half).max(0)
+    return jnp.maximum(linalg.norm(high - low), 1e-3)
+
+
+def misfit(fix: Fix, points):
+    """Mean distance [] of points [N, 3] from the boxes of their parts, over the object's diagonal.
+
+    The one thing in a pose that its own history cannot make look right: sizes are the category's.
+    """
+    poses = se3.compose(fix.root, fix.parts)
+    own = se3.act(se3.inverse(poses)[fix.labels], points[:, None])[:, 0]
+    sizes, centers = fix.constants.size[fix.labels], fix.constants.center[fix.labels]
+    outside = jnp.maximum(jnp.abs(own - centers) - sizes / 2, 0.0)
+    return linalg.norm(outside).mean() / diagonal(fix.constants)

@@ -1,0 +1,148 @@
+"""Keyframes (paper Sec 5.3.2): when there is a new one, and what its pose is."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from caper_jax.geometry import linalg, se3, so3
+from caper_jax.tracking.config import TrackerConfig
+from caper_jax.tracking.fix import Fix, estimate_fix, misfit
+from caper_jax.tracking.registration import (
+    Surface,
+    empty_surface,
+    extend_surface,
+    move_surface,
+)
+from caper_jax.tracking.state import Keyframe, TrackerState
+
+_BETTER = 0.6  # misfit of an estimate over the track's, at which it may replace the track
+
+
+def is_due(energy, unmatched, age, config: TrackerConfig):
+    """Whether the policy wants this frame as keyframe.
+
+    Args:
+      energy: [] Eq 16.
+      unmatched: [] share of points off the surface.
+      age: [] frames since the last keyframe.
+      config: static.
+    """
+    if config.policy == "none":
+        return jnp.asarray(True)
+    if config.policy == "fixed":
+        return age + 1 >= config.interval
+    return (energy > config.threshold) | (unmatched > config.unseen)
+
+
+def contradicts(first, second, config: TrackerConfig):
+    """Whether two root poses [4, 4] contradict each other, not only differ."""
+    turn = so3.geodesic_distance(first[:3, :3], second[:3, :3])
+    shift = linalg.norm(first[:3, 3] - second[:3, 3])
+    return (turn > jnp.radians(config.gate_deg)) | (shift > config.gate)
+
+
+def corrected(
+    variables,
+    points,
+    labels,
+    tracked: Fix,
+    state: TrackerState,
+    due,
+    doubted,
+    category,
+    network,
+    config: TrackerConfig,
+):
+    """The pose of a frame that may be a keyframe: the track's, the estimator's, or between them.
+
+    Where the track is in order, the static estimator's pose is weighed against it by their
+    variances, one Kalman step on the manifold; where it is lost, or doubted and worse than the
+    estimate by its own measure, the estimate replaces it.
+
+    Args:
+      variables, points, labels, category, network: as for ``fix.measure``.
+      tracked: the track's pose.
+      state: before this frame.
+      due: [] bool, the policy wants a keyframe.
+      doubted: [] bool, the last frames contradicted the track.
+      config: static.
+
+    Returns:
+      (fix, variance [3], whether the estimator was asked, whether it replaced the track).
+    """
+    asked = state.lost | doubted
+    if config.policy in ("fixed", "dynamic"):
+        asked |= due
+    static = jax.lax.cond(
+        asked,
+        lambda: estimate_fix(variables, points, labels, category, network),
+        lambda: tracked,
+    )
+    better = misfit(static, points) < _BETTER * misfit(tracked, points)
+    replaced = state.lost | (doubted & better)
+
+    static_variance = jnp.square(
+        jnp.array([config.static_rotation, config.static_translation, config.static_joint])
+    )
+    drift = jnp.array([config.drift_rotation, config.drift_translation, config.drift_joint])
+    grown = state.variance + jnp.where(due, jnp.square(drift), 0.0)
+    gain = grown / (grown + static_variance) if config.filtered else jnp.ones(3)
+    # One that contradicts the track is not averaged in: a mean of two poses is neither.
+    averaged = asked & ~contradicts(tracked.root, static.root, config)
+    gain = jnp.where(averaged, gain, 0.0)
+
+    correction = se3.log(se3.compose(se3.inverse(tracked.root), static.root))
+    correction *= jnp.repeat(gain[:2], 3, total_repeat_length=6)
+    fused = Fix(
+        root=se3.compose(tracked.root, se3.exp(correction)),
+        joint_state=tracked.joint_state + gain[2] * (static.joint_state - tracked.joint_state),
+        parts=se3.interpolate(tracked.parts, static.parts, gain[2]),
+        labels=tracked.labels,
+        constants=tracked.constants,
+    )
+    fix = select(replaced, static, fused)
+    variance = jnp.where(replaced, static_variance, (1.0 - gain) * grown)
+    return fix, variance, asked, replaced
+
+
+def make_keyframe(fix: Fix, points) -> Keyframe:
+    """A frame of this pose and cloud [N, 3] as keyframe."""
+    return Keyframe(
+        root=fix.root,
+        joint_state=fix.joint_state,
+        parts=fix.parts,
+        points=se3.act(se3.inverse(fix.root), points),
+        labels=fix.labels,
+        age=jnp.asarray(0, jnp.int32),
+    )
+
+
+def moved_cloud(key: Keyframe, fix: Fix):
+    """The keyframe's cloud [N, 3], each part moved by its increment, in the root's frame."""
+    motions = se3.compose(fix.parts, se3.inverse(key.parts))
+    return se3.act(motions[key.labels], key.points[:, None])[:, 0]
+
+
+def grown_surface(surface: Surface, fix: Fix, points, config: TrackerConfig) -> Surface:
+    """The surface with what a new keyframe shows of it for the first time."""
+    poses = se3.compose(fix.root, fix.parts)
+    own = se3.act(se3.inverse(poses)[fix.labels], points[:, None])[:, 0]
+    return extend_surface(surface, own, fix.labels, config.registration)
+
+
+def rebased_surface(
+    surface: Surface, tracked: Fix, fix: Fix, replaced, config: TrackerConfig
+) -> Surface:
+    """The surface where it was in the camera's frame, said in corrected part frames.
+
+    An estimate that replaces the track says that those frames meant nothing: nothing is kept.
+    """
+    old, new = (se3.compose(f.root, f.parts) for f in (tracked, fix))
+    moved = move_surface(surface, se3.compose(se3.inverse(new), old))
+    return select(replaced, empty_surface(config.registration), moved)
+
+
+def select(condition, yes, no):
+    """``where`` for whole pytrees."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
