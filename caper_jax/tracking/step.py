@@ -71,8 +71,8 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
     constants = Constants(
         axis=jnp.tile(jnp.array([1.0, 0.0, 0.0]), (joints, 1)),
         pivot=jnp.zeros((joints, 3)),
-        size=jnp.asarray(category.mean_size, jnp.float32) * category.unit,
-        center=jnp.asarray(category.mean_center, jnp.float32) * category.unit,
+        size=jnp.asarray(category.mean_size) * category.unit,
+        center=jnp.asarray(category.mean_center) * category.unit,
         seen=jnp.asarray(0.0),
         known=jnp.zeros(joints),
     )
