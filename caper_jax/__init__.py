@@ -14,6 +14,10 @@ from caper_jax.articulation.category import Category, Equivalence, Joint, Object
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, Prediction, estimate, load
+from caper_jax.tracker import Tracker, load_tracker
+from caper_jax.tracking.config import TrackerConfig
+from caper_jax.tracking.state import Observation, TrackerState
+from caper_jax.tracking.step import Tracked, track_step
 
 __all__ = [
     "ArticulatedPose",
@@ -23,7 +27,12 @@ __all__ = [
     "Estimator",
     "Joint",
     "ObjectModel",
+    "Observation",
     "Prediction",
+    "Tracked",
+    "Tracker",
+    "TrackerConfig",
+    "TrackerState",
     "Viewpoint",
     "__version__",
     "articulation",
@@ -31,4 +40,6 @@ __all__ = [
     "estimate",
     "geometry",
     "load",
+    "load_tracker",
+    "track_step",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from caper_jax.configuration import from_dict, override
 from caper_jax.data.cloud import MIN_POINTS, sample_points
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load
@@ -39,7 +41,7 @@ class Tracker:
 
     def __init__(self, estimator: Estimator, config: TrackerConfig | None = None) -> None:
         self.estimator = estimator
-        self.config = config or TrackerConfig()
+        self.config = config or config_for(estimator)
         static: dict[str, Any] = {
             "category": estimator.category,
             "network": estimator.network,
@@ -140,17 +142,36 @@ class Tracker:
         return jax.lax.scan(partial(self.function, variables), state, observations)
 
 
+def config_for(estimator: Estimator, *assignments: str) -> TrackerConfig:
+    """The settings that suit a model: the defaults, changed by the "tracker" section of its card.
+
+    Args:
+      estimator: the model.
+      assignments: "key=value" on top, e.g. "policy=fixed" or "registration.steps=0".
+
+    Raises:
+      CaperError: unknown keys or bad values in either.
+    """
+    section = estimator.card.get("tracker", {})
+    return override(from_dict(TrackerConfig, section, "tracker of the model card"), *assignments)
+
+
 def load_tracker(
-    category: str, weights: str | Path | None = None, config: TrackerConfig | None = None
+    category: str,
+    weights: str | Path | None = None,
+    config: TrackerConfig | Sequence[str] = (),
 ) -> Tracker:
     """The tracker of a category, with the weights that ``load`` takes.
 
     Args:
       category: e.g. "box", or "FILE.py:NAME".
       weights: a model directory; by default the one in the package.
-      config: settings.
+      config: settings; or "key=value" changes to those that suit the model, see ``config_for``.
 
     Raises:
       CaperError: see ``estimator.load``.
     """
-    return Tracker(load(category, weights), config)
+    estimator = load(category, weights)
+    if not isinstance(config, TrackerConfig):
+        config = config_for(estimator, *config)
+    return Tracker(estimator, config)

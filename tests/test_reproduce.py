@@ -65,7 +65,7 @@ def run(name, out, *options):
 def known(tmp_path, monkeypatch):
     """Makes table4's box known: a file of videos and a tracker with given errors."""
     dataset = write_videos(tmp_path / "box.h5")
-    monkeypatch.setattr(runs, "find_model", lambda *_: types.SimpleNamespace(category=BOX))
+    monkeypatch.setattr(runs, "find_model", lambda *_: types.SimpleNamespace(category=BOX, card={}))
 
     def use(degrees, share):
         tracker = KnownTracker(dataset, degrees, share)
@@ -185,7 +185,9 @@ def test_categories_without_model_or_data_are_named_and_not_invented(tmp_path, c
     assert not list((tmp_path / "out").glob("*.png"))
 
     write_videos(tmp_path / "box.h5")
-    monkeypatch.setattr(runs, "find_model", lambda *_: types.SimpleNamespace(category=LAPTOP))
+    monkeypatch.setattr(
+        runs, "find_model", lambda *_: types.SimpleNamespace(category=LAPTOP, card={})
+    )
     data = ["--data", str(tmp_path / "box.h5"), "--format", "caper"]
     assert run("table6", tmp_path / "out", "--category", "laptop", *data) == 0
     assert cells(capsys.readouterr().out, "laptop", "lid", "no data")[0] == "5.00"
@@ -220,7 +222,7 @@ class TestModels:
 
         monkeypatch.setattr(runs, "generated_videos", draw)
         config = TrackerConfig(registration=RegistrationConfig(gaussians=32))
-        monkeypatch.setattr(runs, "TrackerConfig", lambda: config)
+        monkeypatch.setattr(runs, "config_for", lambda _: config)
         monkeypatch.setattr(jax, "jit", quick_jit)
         options = ["--weights", str(folder), "--network-alone", "--seed", "5", "--videos", "7"]
         assert run("jitter", tmp_path, *options) == 0
@@ -276,10 +278,15 @@ def test_videos_of_a_public_layout_and_frames_that_are_none(tmp_path):
 class TestKeyframes:
     def test_only_without_keyframes_nothing_comes_to_the_rescue(self):
         options = Options(out=Path("out"), network_alone=True)
-        configs = {policy: keyframes.policy_config(policy, options) for policy in ("none", "fixed")}
+        estimator = types.SimpleNamespace(card={"tracker": {"damping": 0.5}})
+        configs = {
+            policy: keyframes.policy_config(policy, estimator, options)
+            for policy in ("none", "fixed")
+        }
         assert configs["none"].policy == "none" and configs["none"].patience > 10**6
-        assert configs["fixed"].patience == runs.tracker_config(options).patience < 10
+        assert configs["fixed"].patience == runs.tracker_config(estimator, options).patience < 10
         assert all(config.registration.steps == 0 for config in configs.values())
+        assert all(config.damping == 0.5 for config in configs.values())
 
     def test_slopes_are_those_of_the_videos(self):
         rng = np.random.default_rng(0)
@@ -371,7 +378,9 @@ class TestIncrements:
             return types.SimpleNamespace(finished=len(started) < 2)
 
         monkeypatch.setattr(increments.training, "train", train)
-        monkeypatch.setattr(increments, "load", lambda *_: types.SimpleNamespace(network=None))
+        monkeypatch.setattr(
+            increments, "load", lambda *_: types.SimpleNamespace(network=None, card={})
+        )
         options = Options(out=tmp_path, steps=7, overrides=("training.batch_size=3",))
         with pytest.raises(CaperError, match="finished run of another network"):
             increments.trained("box", "euclidean", 2, options)

@@ -21,6 +21,7 @@ from test_visualization import ARM, arm_pose
 
 from caper_jax import categories, cli
 from caper_jax.cli import realsense, track_live, track_videos
+from caper_jax.configuration import override
 from caper_jax.data import hdf5
 from caper_jax.data.live import pack_frame, read_frames
 from caper_jax.errors import CaperError
@@ -71,7 +72,7 @@ def scripted(monkeypatch):
     made = []
 
     def load(category, weights, config):
-        made.append(Scripted(random_pose(5), config))
+        made.append(Scripted(random_pose(5), override(TrackerConfig(), *config)))
         return made[-1]
 
     monkeypatch.setattr(track_videos, "load_recorder", load)

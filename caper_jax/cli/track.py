@@ -12,7 +12,7 @@ from caper_jax.cli import common
 from caper_jax.errors import CaperError
 
 if TYPE_CHECKING:
-    from caper_jax.tracking.config import TrackerConfig
+    pass
 
 VIDEO_FORMATS = ("caper", "captra", "folder", "pm-videos", "reart-videos")
 # Options of recorded videos, by the attribute that argparse gives them.
@@ -119,31 +119,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     from caper_jax.tracker import load_tracker
 
     category = categories.get(arguments.category)
-    config = _config(arguments)
     if arguments.live is not None:
         _refuse_recorded(arguments)
         with track_live.open_stream(arguments.live) as frames:
-            track_live.track_stream(load_tracker(category.name, arguments.weights, config), frames)
+            tracker = load_tracker(category.name, arguments.weights, _settings(arguments))
+            track_live.track_stream(tracker, frames)
         return 0
     if arguments.out is None:
         raise CaperError("--data needs --out, the folder for the results")
     common.check_folder(arguments.out, "--out")
     dataset, videos = track_videos.open_videos(arguments, category.name)
-    recorder = track_videos.load_recorder(category.name, arguments.weights, config)
+    recorder = track_videos.load_recorder(category.name, arguments.weights, _settings(arguments))
     track_videos.track_all(arguments, recorder, dataset, videos)
     return 0
 
 
-def _config(arguments: argparse.Namespace) -> TrackerConfig:
-    from caper_jax.configuration import override
-    from caper_jax.tracking.config import TrackerConfig
-
+def _settings(arguments: argparse.Namespace) -> list[str]:
+    """The tracker's settings as "key=value"."""
     named = [
         f"{key}={getattr(arguments, key)}"
         for key in ("policy", "interval", "threshold")
         if getattr(arguments, key) is not None
     ]
-    return override(TrackerConfig(), *named, *arguments.set)
+    return named + arguments.set
 
 
 def _refuse_recorded(arguments: argparse.Namespace) -> None:

@@ -25,8 +25,7 @@ from caper_jax.evaluation.track_report import format_tracks, json_line, track_re
 from caper_jax.evaluation.tracking import Track, summarise_tracks, track_video
 from caper_jax.files import write_atomically
 from caper_jax.progress import Progress, progress
-from caper_jax.tracker import Tracker
-from caper_jax.tracking.config import TrackerConfig
+from caper_jax.tracker import Tracker, config_for
 from caper_jax.tracking.step import Tracked
 from caper_jax.visualization.scene import Scene
 from caper_jax.visualization.track import Tile, evenly_spaced, write_sheet, write_states
@@ -51,9 +50,10 @@ class Recorder(Tracker):
         return result
 
 
-def load_recorder(category: str, weights: Path | None, config: TrackerConfig) -> Recorder:
+def load_recorder(category: str, weights: Path | None, settings: Sequence[str]) -> Recorder:
     """The tracker of a category; see ``load_tracker``."""
-    recorder = Recorder(load(category, weights), config)
+    estimator = load(category, weights)
+    recorder = Recorder(estimator, config_for(estimator, *settings))
     recorder.reset()
     return recorder
 

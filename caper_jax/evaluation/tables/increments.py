@@ -18,8 +18,7 @@ from caper_jax.evaluation.tables.paper import TABLES, Figures
 from caper_jax.evaluation.tables.render import Report, Table, number, spread
 from caper_jax.model_files import CARD_FILE
 from caper_jax.networks.caper import IncrementKind
-from caper_jax.tracker import Tracker
-from caper_jax.tracking.config import TrackerConfig
+from caper_jax.tracker import Tracker, config_for
 from caper_jax.training import run as training
 
 KINDS: tuple[IncrementKind, ...] = get_args(IncrementKind)
@@ -57,7 +56,7 @@ def run(name: str, options: Options) -> Report:
             found[kind] = []
             for seed in range(options.seeds):
                 estimator = trained(key, kind, seed, options)
-                tracker = Tracker(estimator, runs.network_alone(TrackerConfig()))
+                tracker = Tracker(estimator, runs.network_alone(config_for(estimator)))
                 tracks = runs.track_all(tracker, source, condition)
                 summary = runs.summarise(tracks, source, condition)
                 found[kind].append({"seed": seed, "steps": estimator.card["steps"], **summary})

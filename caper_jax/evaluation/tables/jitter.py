@@ -49,7 +49,7 @@ def run(name: str, options: Options) -> Report:
         estimates = [_estimates(estimator, videos, video) for video in videos.index]
         single = tremble(estimates, truths, estimator.category)
         result[key] = {"frame_by_frame": single}
-        tracker = Tracker(estimator, runs.tracker_config(options))
+        tracker = Tracker(estimator, runs.tracker_config(estimator, options))
         for condition in runs.conditions(options):
             tracks = runs.track_all(tracker, videos, condition)
             tracked = tremble([track.pose for track in tracks], truths, estimator.category)

@@ -10,6 +10,7 @@ import numpy as np
 
 from caper_jax import categories
 from caper_jax.articulation.category import Category
+from caper_jax.estimator import Estimator
 from caper_jax.evaluation.tables import comparison, runs
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.paper import TABLES
@@ -99,16 +100,16 @@ def _measure(name: str, options: Options, videos: int, frames: int) -> dict[str,
         return {"data": runs.NO_DATA, "policies": {}}
     found, condition = {}, runs.Condition()
     for policy in POLICIES:
-        tracker = Tracker(estimator, policy_config(policy, options))
+        tracker = Tracker(estimator, policy_config(policy, estimator, options))
         tracks = runs.track_all(tracker, source, condition)
         summary = runs.summarise(tracks, source, condition)
         found[policy] = {**summary, "growth": error_growth(tracks, source.category)}
     return {"data": source.description, "policies": found}
 
 
-def policy_config(policy: Policy, options: Options) -> TrackerConfig:
+def policy_config(policy: Policy, estimator: Estimator, options: Options) -> TrackerConfig:
     """The tracker of a policy; without keyframes, nothing rescues a track that drifts away."""
-    config = replace(runs.tracker_config(options), policy=policy)
+    config = replace(runs.tracker_config(estimator, options), policy=policy)
     return replace(config, patience=_NEVER) if policy == "none" else config
 
 

@@ -31,7 +31,7 @@ def run(name: str, options: Options) -> Report:
     condition = runs.Condition()
     rows, facts, result = [], [], {}
     for key, estimator in models.items():
-        tracker = Tracker(estimator, runs.tracker_config(options))
+        tracker = Tracker(estimator, runs.tracker_config(estimator, options))
         found = {}
         for mode in MODES:
             videos = runs.open_videos(options, estimator.category, VIDEOS, FRAMES, mode)

@@ -26,7 +26,7 @@ from caper_jax.evaluation.tracking import (
 )
 from caper_jax.model_files import CARD_FILE, read_model
 from caper_jax.progress import progress
-from caper_jax.tracker import Tracker
+from caper_jax.tracker import Tracker, config_for
 from caper_jax.tracking.config import TrackerConfig
 
 NO_MODEL = "no model"
@@ -62,9 +62,10 @@ def conditions(options: Options) -> list[Condition]:
     return rows + [Condition(given_masks=True)] if options.given_masks else rows
 
 
-def tracker_config(options: Options) -> TrackerConfig:
-    """The default one, or the one whose poses are the network's increments alone."""
-    return network_alone(TrackerConfig()) if options.network_alone else TrackerConfig()
+def tracker_config(estimator: Estimator, options: Options) -> TrackerConfig:
+    """The model's own, or the one whose poses are the network's increments alone."""
+    config = config_for(estimator)
+    return network_alone(config) if options.network_alone else config
 
 
 def network_alone(config: TrackerConfig) -> TrackerConfig:

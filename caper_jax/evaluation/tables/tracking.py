@@ -68,7 +68,7 @@ def _measure(name: str, options: Options, videos: int, frames: int) -> dict[str,
     source = runs.open_videos(options, estimator.category, videos, frames)
     if source is None:
         return {"missing": runs.NO_DATA, "runs": []}
-    tracker = Tracker(estimator, runs.tracker_config(options))
+    tracker = Tracker(estimator, runs.tracker_config(estimator, options))
     found = []
     for condition in runs.conditions(options):
         tracks = runs.track_all(tracker, source, condition)
