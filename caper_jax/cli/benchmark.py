@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from caper_jax.cli import benchmark_loader, common
+from caper_jax.cli import benchmark_loader, benchmark_tracker, common
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ def build_parser() -> argparse.ArgumentParser:
             ("generator", "frames/s of the generator, all categories"),
             ("generator --category box --json speed.json", "one category, kept in a file"),
             ("loader --category box --data box.h5", "feeding from disk against memory"),
+            ("tracker --category laptop", "frames/s of the tracker, beside the estimator"),
             ("generator --category box --set table=0.5", "with table pixels in half the masks"),
         ],
     )
@@ -173,5 +174,10 @@ BENCHMARKS = {
         "what feeding from disk costs a training step of the fast preset",
         benchmark_loader.add_arguments,
         benchmark_loader.run,
+    ),
+    "tracker": Benchmark(
+        "one step of the tracker against one single-frame estimate, batch 1",
+        benchmark_tracker.add_arguments,
+        benchmark_tracker.run,
     ),
 }

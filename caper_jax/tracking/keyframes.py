@@ -87,10 +87,13 @@ def corrected(
     )
     drift = jnp.array([config.drift_rotation, config.drift_translation, config.drift_joint])
     grown = state.variance + jnp.where(due, jnp.square(drift), 0.0)
-    gain = grown / (grown + static_variance) if config.filtered else jnp.ones(3)
-    # One that contradicts the track is not averaged in: a mean of two poses is neither.
-    averaged = asked & ~contradicts(tracked.root, static.root, config)
-    gain = jnp.where(averaged, gain, 0.0)
+    if config.filtered:
+        # One that contradicts the track is not averaged in: a mean of two poses is neither.
+        apart = contradicts(tracked.root, static.root, config)
+        gain = jnp.where(apart, 0.0, grown / (grown + static_variance))
+    else:
+        gain = jnp.ones(3)
+    gain = jnp.where(asked, gain, 0.0)
 
     correction = se3.log(se3.compose(se3.inverse(tracked.root), static.root))
     correction *= jnp.repeat(gain[:2], 3, total_repeat_length=6)

@@ -79,6 +79,8 @@ class TrackerState:
         drifted from what the static estimator or the user gave.
       keyframe: what increments refer to.
       surface: what was seen of the parts so far, for registration.
+      accepted: [] the misfit that the static estimator was asked about and could not better, so
+        that objects of unusual size are not doubted again and again.
       doubtful: [] int32, frames in a row that disagreed with the track.
       lost: [] bool, the next frame with points starts afresh from the static estimator.
     """
@@ -92,5 +94,6 @@ class TrackerState:
     variance: Any
     keyframe: Keyframe
     surface: Surface
+    accepted: Any
     doubtful: Any
     lost: Any

@@ -39,6 +39,7 @@ from caper_jax.tracking.registration import (
 )
 from caper_jax.tracking.state import Constants, Keyframe, Observation, TrackerState
 
+_ACCEPTED = 1.3  # how much worse than an accepted misfit contradicts again
 _ENERGY_STRIDE = 2  # every so-manieth point enters the energy
 
 
@@ -94,6 +95,7 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
         variance=jnp.zeros(3),
         keyframe=keyframe,
         surface=empty_surface(config.registration),
+        accepted=jnp.asarray(0.0),
         doubtful=jnp.asarray(0, jnp.int32),
         lost=jnp.asarray(True),
     )
@@ -188,9 +190,10 @@ def track_step(
     tracked = Fix(root, joints, parts.at(joints), found.labels, constants)
 
     unmatched = mismatch(*against, (root, joints), config.registration)
+    outside = misfit(tracked, points)
     contradicted = (
         (unmatched > config.mismatch)
-        | (misfit(tracked, points) > config.misfit)
+        | (outside > jnp.maximum(config.misfit, _ACCEPTED * state.accepted))
         | contradicts(root, found.root, config)
     )
     doubtful = jnp.where(contradicted, state.doubtful + 1, 0)
@@ -239,6 +242,9 @@ def track_step(
         variance=variance,
         keyframe=select(due, make_keyframe(fix, points), replace(key, age=key.age + 1)),
         surface=surface,
+        accepted=jnp.where(
+            replaced, 0.0, jnp.where(doubted, jnp.maximum(outside, state.accepted), state.accepted)
+        ),
         # A pose from the static estimator alone is on trial: one contradiction undoes it.
         doubtful=jnp.where(replaced, config.patience - 1, jnp.where(doubted, 0, doubtful)),
         lost=jnp.asarray(False),
