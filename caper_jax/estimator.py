@@ -217,13 +217,15 @@ def shipped_weights() -> Path:
     return Path(str(resources.files("caper_jax"))) / "assets" / "weights"
 
 
-def load(category: str, weights: str | Path | None = None) -> Estimator:
+def load(category: str, weights: str | Path | None = None, object_scale: float = 1.0) -> Estimator:
     """The estimator of a category.
 
     Args:
       category: e.g. "box", or "FILE.py:NAME" (see ``categories.get``).
       weights: a model directory (weights.npz, model.json) as training writes it; by default the
         one that ships with the package.
+      object_scale: how many times as large the objects are as those the model was trained on; the
+        shipped models know real sizes, PartNet's objects in PM-Videos and ArtImage are larger.
 
     Raises:
       CaperError: unknown category, no model of it in the package, a damaged model, or one of
@@ -252,7 +254,7 @@ def load(category: str, weights: str | Path | None = None) -> Estimator:
         raise CaperError(f"{directory / CARD_FILE} lacks run.network; train again") from error
     network = from_dict(NetworkConfig, sizes, str(directory / CARD_FILE))
     _check_variables(directory, variables, definition, network)
-    return Estimator(definition, network, variables, card)
+    return Estimator(definition.scaled(object_scale), network, variables, card)
 
 
 def _check_variables(directory: Path, variables, category: Category, network: NetworkConfig):

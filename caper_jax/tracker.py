@@ -160,6 +160,7 @@ def load_tracker(
     category: str,
     weights: str | Path | None = None,
     config: TrackerConfig | Sequence[str] = (),
+    object_scale: float = 1.0,
 ) -> Tracker:
     """The tracker of a category, with the weights that ``load`` takes.
 
@@ -167,11 +168,12 @@ def load_tracker(
       category: e.g. "box", or "FILE.py:NAME".
       weights: a model directory; by default the one in the package.
       config: settings; or "key=value" changes to those that suit the model, see ``config_for``.
+      object_scale: see ``estimator.load``.
 
     Raises:
       CaperError: see ``estimator.load``.
     """
-    estimator = load(category, weights)
+    estimator = load(category, weights, object_scale)
     if not isinstance(config, TrackerConfig):
         config = config_for(estimator, *config)
     return Tracker(estimator, config)

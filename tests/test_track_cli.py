@@ -71,7 +71,7 @@ def scripted(monkeypatch):
     """Replaces the models; gives the trackers that were asked for."""
     made = []
 
-    def load(category, weights, config):
+    def load(category, weights, config, object_scale):
         made.append(Scripted(random_pose(5), override(TrackerConfig(), *config)))
         return made[-1]
 

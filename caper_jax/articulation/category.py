@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -134,6 +134,34 @@ class Category:
     def parents(self) -> tuple[int, ...]:
         """[K-1] parent part of each joint."""
         return tuple(joint.parent for joint in self.joints)
+
+    def scaled(self, factor: float) -> Category:
+        """The category of objects that are ``factor`` times as large; same networks, same weights.
+
+        Raises:
+          CaperError: a factor that is not positive.
+        """
+        from caper_jax.errors import CaperError
+
+        if not 0 < factor < np.inf:
+            raise CaperError(f"object scale must be positive, got {factor}")
+
+        def times(rows):
+            return tuple(tuple(factor * value for value in row) for row in rows)
+
+        joints = tuple(
+            joint
+            if joint.type == "revolute"
+            else replace(joint, limits=(factor * joint.limits[0], factor * joint.limits[1]))
+            for joint in self.joints
+        )
+        return replace(
+            self,
+            unit=self.unit / factor,
+            joints=joints,
+            mean_size=times(self.mean_size),
+            mean_center=times(self.mean_center),
+        )
 
     def __post_init__(self) -> None:
         from caper_jax.errors import CaperError

@@ -88,6 +88,18 @@ def create_parser(
     )
 
 
+def add_object_scale(parser: argparse.ArgumentParser) -> None:
+    """The option of commands that load a model."""
+    parser.add_argument(
+        "--object-scale",
+        type=positive_float,
+        default=1.0,
+        metavar="S",
+        help="the objects are S times as large as those the model was trained on, e.g. 3.7 for the "
+        "laptops of PM-Videos and ArtImage (PartNet units read as metres)",
+    )
+
+
 def check_folder(folder: Path, argument: str) -> None:
     """Refuses, before any work, a folder that cannot be made or written in.
 

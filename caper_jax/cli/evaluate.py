@@ -48,6 +48,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--limit", type=common.positive_int, help="at most so many frames, from the first"
     )
+    common.add_object_scale(parser)
     parser.add_argument("--out", required=True, type=Path, help="folder for the results")
     return parser
 
@@ -73,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.predictor != "truth":
         from caper_jax.estimator import load
 
-        estimator = load(category.name, arguments.weights)
+        estimator = load(category.name, arguments.weights, arguments.object_scale)
         weights = str(arguments.weights or f"shipped with the package ({category.name})")
         if arguments.predictor == "model":
             predictor = protocol.model_predictor(estimator)

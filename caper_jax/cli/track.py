@@ -107,6 +107,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="another setting of the tracker, e.g. filtered=false or registration.steps=0; may be "
         "repeated",
     )
+    common.add_object_scale(parser)
     parser.add_argument("--out", type=Path, help="folder for the results of --data")
     return parser
 
@@ -114,34 +115,35 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
-    from caper_jax import categories
     from caper_jax.cli import track_live, track_videos
     from caper_jax.tracker import load_tracker
 
-    category = categories.get(arguments.category)
+    model = _model(arguments)
     if arguments.live is not None:
         _refuse_recorded(arguments)
         with track_live.open_stream(arguments.live) as frames:
-            tracker = load_tracker(category.name, arguments.weights, _settings(arguments))
-            track_live.track_stream(tracker, frames)
+            track_live.track_stream(load_tracker(*model), frames)
         return 0
     if arguments.out is None:
         raise CaperError("--data needs --out, the folder for the results")
     common.check_folder(arguments.out, "--out")
-    dataset, videos = track_videos.open_videos(arguments, category.name)
-    recorder = track_videos.load_recorder(category.name, arguments.weights, _settings(arguments))
+    dataset, videos = track_videos.open_videos(arguments, model[0])
+    recorder = track_videos.load_recorder(*model)
     track_videos.track_all(arguments, recorder, dataset, videos)
     return 0
 
 
-def _settings(arguments: argparse.Namespace) -> list[str]:
-    """The tracker's settings as "key=value"."""
-    named = [
+def _model(arguments: argparse.Namespace) -> tuple[str, Path | None, list[str], float]:
+    """Which tracker: category, weights, settings as "key=value", scale of the objects."""
+    from caper_jax import categories
+
+    settings = [
         f"{key}={getattr(arguments, key)}"
         for key in ("policy", "interval", "threshold")
         if getattr(arguments, key) is not None
     ]
-    return named + arguments.set
+    name = categories.get(arguments.category).name
+    return name, arguments.weights, settings + arguments.set, arguments.object_scale
 
 
 def _refuse_recorded(arguments: argparse.Namespace) -> None:

@@ -50,9 +50,11 @@ class Recorder(Tracker):
         return result
 
 
-def load_recorder(category: str, weights: Path | None, settings: Sequence[str]) -> Recorder:
+def load_recorder(
+    category: str, weights: Path | None, settings: Sequence[str], object_scale: float
+) -> Recorder:
     """The tracker of a category; see ``load_tracker``."""
-    estimator = load(category, weights)
+    estimator = load(category, weights, object_scale)
     recorder = Recorder(estimator, config_for(estimator, *settings))
     recorder.reset()
     return recorder
