@@ -95,7 +95,7 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
         variance=jnp.zeros(3),
         keyframe=keyframe,
         surface=empty_surface(config.registration),
-        accepted=jnp.asarray(0.0),
+        accepted=jnp.zeros(()),
         doubtful=jnp.asarray(0, jnp.int32),
         lost=jnp.asarray(True),
     )
