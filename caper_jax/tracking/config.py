@@ -20,9 +20,10 @@ class TrackerConfig:
       policy: when a frame becomes the keyframe that increments refer to (Sec 5.3.2, Alg 1).
         "dynamic": when the energy exceeds ``threshold`` or the share of unmatched points
         ``unseen``; its pose then comes from the static estimator. "fixed": every ``interval``
-        frames, likewise. "none": every frame, with the tracked pose, so that errors add up.
-        "promote": like "dynamic", but with the tracked pose (errata: the reading of Algorithm 1's
-        l. 8 in the code it goes back to); the static estimator only helps where the track is lost.
+        frames, likewise. "none": every frame, with the tracked pose and nothing else kept, so that
+        errors add up. "promote": like "dynamic", but with the tracked pose (errata:
+        the reading of Algorithm 1's l. 8 in the code it goes back to); the static estimator only
+        helps where the track is lost.
       interval: of "fixed", in frames.
       threshold: phi of Eq 16, relative to the object's diagonal.
       unseen: share of points off the surface seen so far that asks for a new keyframe.
@@ -30,13 +31,14 @@ class TrackerConfig:
         variances; off, the keyframe takes the estimator's as it is (the paper's text).
       anchored: let the network see the cloud canonicalised by the predicted pose, a step on from
         the keyframe's, instead of the keyframe's own; the increment is the same, but small.
-      registration: of the cloud to the keyframe's; ``registration.steps = 0`` leaves the network's
-        increment alone (the paper's tracker).
+      registration: of the cloud to the surface seen so far; ``registration.steps = 0`` leaves the
+        network's increment alone (the paper's tracker).
       damping: how much of the velocity is kept from frame to frame.
       velocity_gain: how much of what the prediction missed goes into the velocity.
       gate_deg, gate: rotation and distance (network units) beyond which a static estimate or the
         network contradicts the track, not only differs from it.
-      patience: frames in a row that contradict before the track is called lost.
+      patience: frames in a row that contradict the track before the static estimator may replace
+        it; it does so where it fits its own boxes clearly better.
       misfit: mean distance of the points from their parts' boxes, relative to the object's
         diagonal, above which a frame contradicts the track.
       mismatch: share of unmatched points above which a frame contradicts the track.

@@ -135,15 +135,16 @@ def grown_surface(surface: Surface, fix: Fix, points, config: TrackerConfig) -> 
 
 
 def rebased_surface(
-    surface: Surface, tracked: Fix, fix: Fix, replaced, config: TrackerConfig
+    surface: Surface, tracked: Fix, fix: Fix, anew, config: TrackerConfig
 ) -> Surface:
     """The surface where it was in the camera's frame, said in corrected part frames.
 
-    An estimate that replaces the track says that those frames meant nothing: nothing is kept.
+    Nothing is kept where it begins ``anew``: an estimate that replaces the track says that its
+    frames meant nothing.
     """
     old, new = (se3.compose(f.root, f.parts) for f in (tracked, fix))
     moved = move_surface(surface, se3.compose(se3.inverse(new), old))
-    return select(replaced, empty_surface(config.registration), moved)
+    return select(anew, empty_surface(config.registration), moved)
 
 
 def select(condition, yes, no):

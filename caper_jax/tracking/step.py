@@ -220,10 +220,12 @@ def track_step(
         config,
     )
     due |= replaced
+    # Without keyframes a frame knows of the last one only.
+    anew = replaced | (config.policy == "none")
     surface = jax.lax.cond(
         due,
         lambda: grown_surface(
-            rebased_surface(state.surface, tracked, fix, replaced, config), fix, points, config
+            rebased_surface(state.surface, tracked, fix, anew, config), fix, points, config
         ),
         lambda: state.surface,
     )
