@@ -1,0 +1,272 @@
+"""The tracker on a generated video with the shipped weights, and its transformations by JAX."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+from quick import quick_jit
+from scipy.spatial.transform import Rotation
+from tiny import network, random_variables
+
+from caper_jax import categories, load_tracker
+from caper_jax.data.synthetic.config import GeneratorConfig
+from caper_jax.data.synthetic.videos import VideoGenerator
+from caper_jax.errors import CaperError
+from caper_jax.estimator import Estimator
+from caper_jax.networks.heads import HeadConfig
+from caper_jax.tracker import Tracker
+from caper_jax.tracking.config import TrackerConfig
+from caper_jax.tracking.registration import RegistrationConfig
+from caper_jax.tracking.state import Observation
+
+LAPTOP = categories.get("laptop")
+VIDEOS, FRAMES = 4, 20
+
+
+@pytest.fixture(scope="module")
+def videos():
+    """Batch [V, T, ...] of unseen laptops before a static camera with a sensor's noise."""
+    config = GeneratorConfig(instances=8, grid=64, noise=("kinect",))
+    generator = VideoGenerator(LAPTOP, config, "paper", FRAMES, split="test")
+    draw = quick_jit(partial(generator.batch, videos=VIDEOS))
+    return jax.tree.map(np.asarray, draw(jax.random.key(0)))
+
+
+@pytest.fixture(scope="module")
+def tracker():
+    """One, so that its step is compiled once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax, "jit", quick_jit)
+        return load_tracker("laptop")
+
+
+class Player:
+    """Shows frames of the videos to a tracker and says how far it was off."""
+
+    def __init__(self, tracker, videos) -> None:
+        self.tracker, self.videos = tracker, videos
+
+    def begin(self, video, turn=None):
+        """With the true pose of frame 0, but for a turn (a rotation in the parts' frames)."""
+        pose, turn = self.videos.pose, np.eye(3) if turn is None else turn
+        rotation, translation = pose.rotation[video, 0] @ turn, pose.translation[video, 0]
+        self.tracker.reset(self.videos.points[video, 0], rotation, translation)
+
+    def show(self, video, frame, points=None):
+        """(result, rotation errors of the parts in degrees)."""
+        points = self.videos.points[video, frame] if points is None else points
+        result = jax.tree.map(np.asarray, self.tracker(points))
+        truth = self.videos.pose.rotation[video, frame].astype(float)
+        off = Rotation.from_matrix(truth.swapaxes(-1, -2) @ result.pose.rotation)
+        return result, np.degrees(off.magnitude())
+
+    def play(self, video, frames):
+        """(errors [T, K], lost [T], poses) of these frames."""
+        shown = [self.show(video, frame) for frame in frames]
+        errors = np.array([error for _, error in shown])
+        return errors, np.array([bool(result.lost) for result, _ in shown])
+
+
+@pytest.fixture
+def player(tracker, videos):
+    return Player(tracker, videos)
+
+
+def most(right) -> bool:
+    """All videos but one: weights may be exchanged, and no estimator is right on every object."""
+    right = list(right)
+    return sum(right) >= len(right) - 1
+
+
+class TestShipped:
+    def test_a_given_first_pose_is_followed(self, player):
+        for video in range(VIDEOS):
+            player.begin(video)
+            errors, lost = player.play(video, range(FRAMES))
+            assert errors[1:].mean(0).max() < 5
+            assert lost.mean() < 0.2
+
+    def test_the_estimator_can_begin(self, player):
+        errors = []
+        for video in range(VIDEOS):
+            player.tracker.reset()
+            errors.append(player.play(video, range(FRAMES))[0][1:].mean(0).max())
+        assert most(error < 10 for error in errors)
+
+    def test_frames_that_do_not_show_the_object(self, player):
+        """The pose is held bit for bit, and right again at once."""
+        player.begin(0)
+        player.play(0, range(5))
+        before, _ = player.show(0, 5)
+        nothing = np.full((30, 3), np.nan)
+        for frame, points in ((6, np.zeros((0, 3))), (7, nothing), (8, np.ones((15, 3)))):
+            held, _ = player.show(0, frame, points)
+            assert held.lost and not held.keyframe and not held.estimated
+            jax.tree.map(np.testing.assert_array_equal, held.pose, before.pose)
+        again, errors = player.show(0, 9)
+        assert not again.lost and errors.max() < 5
+
+    def test_a_wrong_first_pose_is_noticed_and_put_right(self, player):
+        turn = Rotation.from_euler("y", 60, degrees=True).as_matrix()
+        right = []
+        for video in range(VIDEOS):
+            player.begin(video, turn)
+            errors, lost = player.play(video, range(6))
+            assert lost[0] and errors[0].max() > 30
+            right.append(not lost[5] and errors[5].max() < 15)
+        assert most(right)
+
+    def test_a_jump_to_another_object_is_noticed(self, player):
+        right = []
+        for video in range(VIDEOS):
+            player.begin(video)
+            player.play(video, range(5))
+            errors, lost = player.play((video + 1) % VIDEOS, range(10, 16))
+            assert errors[0].max() > 20 and lost[0]
+            right.append(not lost[5] and errors[5].max() < 15)
+        assert most(right)
+
+    def test_any_number_of_points_without_recompiling(self, player):
+        player.begin(0)
+        for frame, count in enumerate((1024, 16, 700, 4000)):
+            points = np.tile(player.videos.points[0, frame], (4, 1))[:count]
+            _, errors = player.show(0, frame, points)
+            assert errors.shape == (2,)
+        player.tracker.reset()
+        player.show(0, 0)
+        # Begun with a pose or without, lost or not: all the tests above ran one program.
+        assert player.tracker.step._cache_size() == 1
+
+
+def plates(frames, count=64, seed=0):
+    """[T, N, 3] metres: two plates, one of which opens, as they pass 0.8 m away."""
+    rng = np.random.default_rng(seed)
+    root = Rotation.from_rotvec([0.5, 0.3 + 0.2 * seed, 0.0])
+    pivot, lid, clouds = np.array([0, 0, -0.15]), PLATES == 1, []
+    for frame in range(frames):
+        flat = rng.uniform(-0.15, 0.15, (count, 2))
+        own = np.column_stack([flat[:, 0], np.zeros(count), flat[:, 1]])
+        own[lid] = own[lid][:, [0, 2, 1]] + [0, 0.15, -0.15]
+        turn = Rotation.from_rotvec([0.03 * frame, 0, 0])
+        own[lid] = turn.apply(own[lid] - pivot) + pivot
+        clouds.append(root.apply(own) + [0.01 * frame, 0.0, 0.8])
+    return np.array(clouds)
+
+
+PLATES = np.arange(64) % 2  # parts of the points
+# Nothing contradicts: network, registration, estimator and keyframes all count at every frame.
+TRUSTING = TrackerConfig(
+    registration=RegistrationConfig(gaussians=32, capacity=64, steps=1, stride=1),
+    gate_deg=181.0,
+    gate=1e6,
+    misfit=1e6,
+    mismatch=2.0,
+    patience=1000,
+)
+
+
+def toy(variables=None) -> Tracker:
+    """A tracker with networks that compile soon, for what holds whatever the weights are."""
+    heads = HeadConfig(widths=(8, 8, 8), dropout=0.0, pool_first=True)
+    sizes = network(root_heads=heads, pooled_heads=heads, corrections=0)
+    estimator = Estimator(LAPTOP, sizes, variables or random_variables(LAPTOP, sizes))
+    return Tracker(estimator, TRUSTING)
+
+
+def test_scans_loops_vmaps_and_slopes():
+    """In float64: a scan of each of two videos is a loop over both, with slopes as differences say.
+
+    Slopes along two directions of one frame's cloud, and along one of the weights.
+    """
+    rng = np.random.default_rng(1)
+    frames, moved, away = 11, 4, 6
+    present = np.arange(frames) != away
+    labels = np.tile(PLATES.astype(np.int32), (frames, 1))
+    clouds = np.stack([plates(frames, seed=seed) for seed in range(2)])
+    with jax.enable_x64(True):
+        tracker = toy()
+        begin = tracker.initial_state()
+        variables = jax.tree.map(lambda leaf: np.asarray(leaf, float), tracker.estimator.variables)
+
+        def through(params, cloud, video):
+            """A video, one cloud of which is another."""
+            observations = Observation(video.at[moved].set(cloud), present, labels)
+            return toy(variables | {"params": params}).track(observations, begin)
+
+        @jax.jit
+        def differentiate(here, along, video):
+            return jax.jvp(partial(through, video=video), here, along)
+
+        def directed(leaf):
+            direction = rng.normal(size=leaf.shape)
+            return direction / np.linalg.norm(direction)
+
+        def moved_by(size, leaf, direction):
+            return leaf + size * direction
+
+        def check(way, here):
+            _, slopes = differentiate(here, way, clouds[0])
+            ahead, behind = (
+                differentiate(jax.tree.map(partial(moved_by, size), here, way), still, clouds[0])[0]
+                for size in (1e-6, -1e-6)
+            )
+            for name in ("rotation", "translation", "joint_state", "size"):
+                one, two = (getattr(found.pose, name) for found in (ahead, behind))
+                slope, numeric = getattr(slopes.pose, name), (one - two) / 2e-6
+                scale = np.abs(numeric).max()
+                np.testing.assert_allclose(slope, numeric, rtol=1e-3, atol=1e-4 * scale)
+            # What changes in one frame is still felt in the last.
+            assert np.abs(slopes.pose.translation[-1, -1]).max() > 1e-4
+
+        here = variables["params"], clouds[0, moved]
+        still = jax.tree.map(np.zeros_like, here)
+        check((still[0], directed(here[1])), here)
+        check((still[0], directed(here[1])), here)
+        check((jax.tree.map(directed, here[0]), still[1]), here)
+
+        scans = [differentiate((here[0], video[moved]), still, video)[0] for video in clouds]
+        scans = jax.tree.map(lambda *leaves: np.stack(leaves), *scans)
+        assert scans.keyframe.sum() > 4 and scans.estimated.sum() > 4
+        np.testing.assert_array_equal(scans.lost, [~present] * 2)
+        step = quick_jit(jax.vmap(partial(tracker.function, variables)))
+        states = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), begin)
+        for number in range(frames):
+            frame = Observation(clouds[:, number], present[[number] * 2], labels[[number] * 2])
+            states, found = step(states, frame)
+            expected = jax.tree.map(lambda leaf, at=number: leaf[:, at], scans)
+            jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6), found, expected)
+
+
+class TestMistakes:
+    POINTS = plates(1)[0]
+
+    @pytest.mark.parametrize(
+        ("points", "message"),
+        [
+            (np.zeros((64, 4)), r"points must be \[N, 3\], got shape \(64, 4\)"),
+            (np.zeros((1, 64, 3)), r"points must be \[N, 3\], got shape \(1, 64, 3\)"),
+            (POINTS * 1000, "millimetres"),
+            (POINTS * [1, -1, -1], "behind the camera"),
+        ],
+    )
+    def test_clouds(self, points, message):
+        with pytest.raises(CaperError, match=message):
+            toy()(points)
+
+    def test_labels_of_another_length(self):
+        with pytest.raises(CaperError, match=r"labels must be \[64\] like points, got \(63,\)"):
+            toy()(self.POINTS, np.zeros(63, int))
+
+    @pytest.mark.parametrize(
+        ("rotation", "translation"), [((3, 3), (2, 3)), ((2, 3, 3), (3,)), ((3, 3, 3), (3, 3))]
+    )
+    def test_first_poses_of_other_shapes(self, rotation, translation):
+        with pytest.raises(CaperError, match=r"must be rotation \[2, 3, 3\] and translation"):
+            toy().reset(self.POINTS, np.zeros(rotation), np.zeros(translation))
+
+    def test_a_first_frame_without_the_object(self):
+        with pytest.raises(CaperError, match="too few points to begin with; at least 16"):
+            toy().reset(self.POINTS[:15], np.zeros((2, 3, 3)), np.zeros((2, 3)))
