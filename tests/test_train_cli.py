@@ -10,6 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from caper_jax import cli
 from caper_jax.configuration import update
@@ -21,6 +22,22 @@ ROOT = Path(__file__).resolve().parents[1]
 # A batch that no eight devices can share: compiling for one is faster.
 TINY = ["--category", "box", "--config", str(ROOT / "configs" / "debug.toml")]
 TINY += ["--set", "training.batch_size=3"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_once(tmp_path_factory):
+    """A compilation cache: every training below is one of the same ten steps."""
+    settings = {
+        "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")),
+        "jax_persistent_cache_min_compile_time_secs": 0.5,
+    }
+    before = {name: getattr(jax.config, name) for name in settings}
+    for change in (settings, before):
+        for name, value in change.items():
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()  # looks at the folder when first used, only
+        if change is settings:
+            yield
 
 
 @pytest.fixture(scope="module")
@@ -43,17 +60,17 @@ def test_a_run_leaves_a_model_with_its_card(model):
 
 
 def test_a_file_feeds_a_run_that_resumes_where_it_was(tmp_path, capsys):
-    """Six steps in one go, and again from the second on, end with the same weights."""
+    """Ten steps in one go, and again from the fourth on, end with the same weights."""
     file = tmp_path / "box.h5"
     make = ["generate", "--category", "box", "--split", "train", "--frames", "7", "--grid", "24"]
     assert cli.main([*make, "--points", "256", "--out", str(file)]) == 0
-    feed = ["train", *TINY, "--set", "training.checkpoint_steps=2", "--data", str(file)]
-    steps = ["--steps", "6", "--out"]
+    feed = ["train", *TINY, "--set", "training.checkpoint_steps=4", "--data", str(file)]
+    steps = ["--steps", "10", "--out"]
     assert cli.main([*feed, *steps, str(tmp_path / "one")]) == 0
     card, variables = read_model(tmp_path / "one")
-    assert card["run"]["loader"]["root"] == str(file) and card["steps"] == 6
+    assert card["run"]["loader"]["root"] == str(file) and card["steps"] == 10
 
-    for step in ("4", "6"):  # as if killed after step 2
+    for step in ("8", "10"):  # as if killed after step 4
         shutil.rmtree(tmp_path / "one" / "checkpoints" / step)
     (tmp_path / "one" / "weights.npz").unlink()
     assert cli.main([*feed, *steps, str(tmp_path / "one")]) == 0
@@ -75,7 +92,7 @@ def test_another_configuration_in_the_same_folder_is_refused(model, capsys):
 def test_evaluate_and_estimate_take_the_model(model, tmp_path, capsys):
     file, results = tmp_path / "test.h5", tmp_path / "results"
     common = ["--category", "box", "--frames", "5", "--instances", "3"]
-    arguments = ["--grid", "24", "--points", "256", "--noise", "kinect", "--out", str(file)]
+    arguments = ["--grid", "24", "--points", "256", "--noise", "none", "--out", str(file)]
     assert cli.main(["generate", *common, *arguments]) == 0
     assert cli.main(["generate", *common, *arguments]) == 2  # refuses to overwrite
     assert str(file) in capsys.readouterr().err
@@ -103,15 +120,25 @@ def test_evaluate_and_estimate_take_the_model(model, tmp_path, capsys):
 
 def test_a_model_can_start_another_run(model, tmp_path):
     folder = tmp_path / "more"
-    arguments = ["train", *TINY, "--from", str(model), "--steps", "5", "--seed", "3"]
+    arguments = ["train", *TINY, "--from", str(model), "--steps", "10"]
     assert cli.main([*arguments, "--out", str(folder)]) == 0
-    card, _ = read_model(folder)
-    assert card["started_from"]["steps"] == 10 and card["steps"] == 5
+    card, variables = read_model(folder)
+    assert card["started_from"]["steps"] == 10 and card["steps"] == 10
+    # Ten small steps from there, not from anywhere.
+    moved = [
+        np.abs(leaf - start).max()
+        for leaf, start in zip(
+            jax.tree.leaves(variables["params"]),
+            jax.tree.leaves(read_model(model)[1]["params"]),
+            strict=True,
+        )
+    ]
+    assert 0 < max(moved) < 0.1
 
 
 def test_a_model_of_another_network_cannot(model, tmp_path, capsys):
-    arguments = ["train", "--category", "box", "--from", str(model), "--steps", "5"]
-    assert cli.main([*arguments, "--out", str(tmp_path / "no")]) == 2
+    arguments = ["train", *TINY, "--set", "network.fast.width=8", "--from", str(model)]
+    assert cli.main([*arguments, "--steps", "5", "--out", str(tmp_path / "no")]) == 2
     assert str(model) in capsys.readouterr().err
 
 
