@@ -312,6 +312,7 @@ def test_stage_two_outputs():
     points = jax.ShapeDtypeStruct((2, 64, 3), jnp.float32)
     streams = {name: jax.random.key(0) for name in ("params", "sample", "dropout")}
     expected = {
+        "increment": (2, 6),
         "segmentation": (2, 64, 3),
         "heatmap": (2, 64, 2),
         "offset": (2, 64, 2, 3),

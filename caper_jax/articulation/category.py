@@ -145,6 +145,8 @@ class Category:
 
         if not 0 < factor < np.inf:
             raise CaperError(f"object scale must be positive, got {factor}")
+        if factor == 1.0:
+            return self
 
         def times(rows):
             return tuple(tuple(factor * value for value in row) for row in rows)
