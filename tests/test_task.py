@@ -267,10 +267,11 @@ def test_stage_two_sees_noisy_roots_and_predicted_ones_that_are_nearly_right():
 
 @pytest.fixture(scope="module", params=["fast", "hs"])
 def trained(request):
-    """Losses, first gradients and first metrics of 40 steps on one batch; one cloud is a point."""
+    """Losses, first gradients and first metrics of 80 steps on one batch; one cloud is a point."""
     batch = frames(BOX, [THIN, DEEP, THIN, DEEP])
     batch = batch.replace(points=batch.points.at[3].set(jnp.asarray([0.1, 0.0, 0.8])))
-    task = Task(BOX, network(request.param, point_stride=2), LossConfig())
+    # Heads of either kind, each with one encoder.
+    task = Task(BOX, network(request.param, request.param == "hs", point_stride=2), LossConfig())
     variables = random_variables(BOX, task.network)
     params, state = variables["params"], {"batch_stats": variables["batch_stats"]}
 
@@ -282,7 +283,7 @@ def trained(request):
         return jax.value_and_grad(loss, has_aux=True)(params)
 
     values, first = [], None
-    for _ in range(40):
+    for _ in range(80):
         (value, aux), gradients = differentiate(params)
         values.append(float(value))
         first = first or (gradients, aux)
