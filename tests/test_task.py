@@ -117,6 +117,7 @@ class Oracle(Task):
         voting = distance < 0.2 * distance.max(1, keepdims=True)
         slides = np.array(category.joint_types) == "prismatic"
         output = PartsOutput(
+            increment=jnp.zeros((len(labels), 6)),
             segmentation=100.0 * jax.nn.one_hot(labels[:, ::stride], category.num_parts),
             heatmap=jnp.where(voting, jnp.exp(-distance), 0.0),
             offset=offset,
