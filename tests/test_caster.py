@@ -23,8 +23,8 @@ KINDS = ("box", "cylinder", "ellipsoid", "frustum", "cone")
 FLAT = ("box", "frustum")
 PAIRS = [(kind, None) for kind in KINDS] + list(itertools.product(KINDS, KINDS))
 IDS = ["-".join(filter(None, pair)) for pair in PAIRS]
-DRAWS = 4  # random solids per pair
-SIDE = 64  # rays per side
+DRAWS = 2  # random solids per pair
+SIDE = 72  # rays per side
 
 
 def random_solid(rng: np.random.Generator, kind: str, center, scale: float, hole=None) -> Solid:
