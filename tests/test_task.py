@@ -16,6 +16,7 @@ from caper_jax.articulation.category import Category, Joint
 from caper_jax.articulation.equivalence import second_reading
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.synthetic.scene import Batch
+from caper_jax.geometry import se3
 from caper_jax.networks.canonical import view_rotation
 from caper_jax.networks.caper import PartsOutput, RootOutput
 from caper_jax.training.losses import LossWeights
@@ -93,8 +94,21 @@ class Oracle(Task):
     """A task whose networks answer what they are told to, in place of weights.
 
     ``params`` is (pose [B, ...], labels [B, N], view [B, 3, 3], error [3, 3] of the root in the
-    viewing frame); the points that each stage is given come back as its state.
+    viewing frame); the points that each stage is given come back as its state. Stage II's increment
+    is that from the reference its points were canonicalised with (Eq 10).
     """
+
+    def _noisy_root(self, key, output, truth):
+        self._reference = super()._noisy_root(key, output, truth)
+        return self._reference
+
+    def _increment(self, rotation, translation):
+        """Twists [B, 6] from the reference to a root pose in the viewing frame."""
+        back = jnp.swapaxes(self._reference[:, :3, :3], -1, -2)
+        away = translation - self._reference[:, :3, 3]
+        turn = jnp.einsum("bij,bjk->bik", back, rotation, precision="highest")
+        shift = jnp.einsum("bij,bj->bi", back, away, precision="highest")
+        return se3.log(se3.from_rt(turn, shift))
 
     def _apply(self, stage, params, model_state, points, key):
         pose, labels, view, error = params
@@ -117,7 +131,10 @@ class Oracle(Task):
         voting = distance < 0.2 * distance.max(1, keepdims=True)
         slides = np.array(category.joint_types) == "prismatic"
         output = PartsOutput(
-            increment=jnp.zeros((len(labels), 6)),
+            increment=self._increment(
+                view @ pose.rotation[:, 0],
+                unit * (view * pose.translation[:, 0, None, :]).sum(-1),
+            ),
             segmentation=100.0 * jax.nn.one_hot(labels[:, ::stride], category.num_parts),
             heatmap=jnp.where(voting, jnp.exp(-distance), 0.0),
             offset=offset,
@@ -185,7 +202,7 @@ def test_the_total_weighs_each_loss_as_the_paper_does():
     weights = dataclasses.asdict(CABINETS.config.weights)
     total, _, metrics = CABINETS.play(batch, pose, 2 - jnp.maximum(batch.labels, 0))
     named = {name: metrics[name] for name in weights if name in metrics}
-    assert set(weights) - set(named) == {"twist"}  # of the tracker only
+    assert set(weights) == set(named)
     assert min(named.values()) > 1e-3
     expected = sum(weights[name] * value for name, value in named.items())
     np.testing.assert_allclose(total, expected, rtol=1e-5)
@@ -240,7 +257,9 @@ def aligned(points, reference):
 
 def test_stage_two_sees_noisy_roots_and_predicted_ones_that_are_nearly_right():
     batch = frames(BOX, [DEEP] * 300)
-    config = LossConfig(root_noise_deg=4.0, root_noise=0.05, predicted_root=0.5)
+    config = LossConfig(
+        root_noise_deg=4.0, root_noise=0.05, root_noise_spread=1.0, predicted_root=0.5
+    )
     task = Oracle(BOX, network(), config)
     truth = canonical_points(batch, batch.pose, BOX.unit)
 
@@ -264,6 +283,22 @@ def test_stage_two_sees_noisy_roots_and_predicted_ones_that_are_nearly_right():
     assert predicted.mean() == pytest.approx(0.5, abs=0.1)
     np.testing.assert_allclose(angle[predicted], 10.0, atol=0.1)
     np.testing.assert_allclose(turn[~predicted].std(0), 4.0, rtol=0.2)
+
+
+def test_the_noise_of_the_roots_is_small_and_large():
+    """Its logarithm is spread evenly over ``root_noise_spread`` either way."""
+    count, spread = 4000, 4.0
+    config = LossConfig(root_noise=0.05, root_noise_spread=spread, predicted_root=0.0)
+    pose = jax.tree.map(lambda leaf: jnp.repeat(leaf[:1], count, 0), frames(BOX, [DEEP]).pose)
+    directions = jnp.broadcast_to(jnp.eye(3)[:2], (count, 2, 3))
+    output = RootOutput(directions, jnp.ones((count, 2)), jnp.zeros((count, 3)))
+    reference = Task(BOX, network(), config)._noisy_root(jax.random.key(0), output, pose)
+    shift = np.asarray(reference[:, :3, 3] - pose.translation[:, 0])
+    # The mean square of a factor exp(U(-log 4, log 4)).
+    square = (spread**2 - spread**-2) / (4 * np.log(spread))
+    np.testing.assert_allclose(shift.std(0), 0.05 * np.sqrt(square), rtol=0.1)
+    length = np.linalg.norm(shift, axis=-1)
+    assert np.median(length) < 0.05 * np.sqrt(3) < 0.5 * np.quantile(length, 0.95)
 
 
 @pytest.fixture(scope="module", params=["fast", "hs"])
