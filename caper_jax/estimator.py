@@ -34,7 +34,7 @@ from caper_jax.networks.increment import increment_transform
 from caper_jax.networks.voting import vote
 
 # Part sizes are residuals to a mean; nothing else keeps a regression from going below zero.
-_SMALLEST_SIZE = 0.01  # of the mean
+SMALLEST_SIZE = 0.01  # of the mean
 
 
 @flax.struct.dataclass
@@ -100,8 +100,7 @@ def estimate(
     canonical = canonicalise(cloud, pose[:, :3, :3], pose[:, :3, 3])
     parts = apply("parts", parts_network, canonical)
     axis, pivot = vote(canonical, parts.heatmap, parts.offset, parts.direction)
-    length = jnp.array([1 / unit if kind == "prismatic" else 1.0 for kind in category.joint_types])
-    state, pivot = parts.state * length, pivot / unit
+    state, pivot = parts.state / category.state_units, pivot / unit
 
     back = transpose(view)
     translation = rotate(back, pose[:, None, :3, 3])[:, 0] / unit
@@ -117,7 +116,7 @@ def estimate(
     articulated = ArticulatedPose(
         rotation=poses[..., :3, :3],
         translation=poses[..., :3, 3],
-        size=jnp.maximum(mean_size + parts.size / unit, _SMALLEST_SIZE * mean_size),
+        size=jnp.maximum(mean_size + parts.size / unit, SMALLEST_SIZE * mean_size),
         box_center=jnp.asarray(category.mean_center) + parts.center / unit,
         joint_axis=axis,
         joint_pivot=pivot,

@@ -48,7 +48,7 @@ def test_optional_fields_come_back_or_are_none(tmp_path):
     write_box(path)
     plain = Hdf5Dataset(path)
     assert plain.video is None and plain.frame is None and plain.instance is None
-    assert plain.videos == {} and plain[0].visibility is None
+    assert plain.videos() == {} and plain[0].visibility is None
     visibility = np.linspace(0, 1, 2 * FRAMES).reshape(FRAMES, 2)
     video, frame = np.array([7, 2, 7, 2, 7]), np.array([3, 0, 1, 5, 2])
     write_box(
@@ -63,7 +63,7 @@ def test_optional_fields_come_back_or_are_none(tmp_path):
     np.testing.assert_array_equal(dataset.video, video)
     np.testing.assert_array_equal(dataset.frame, frame)
     np.testing.assert_array_equal(dataset.instance, np.arange(FRAMES))
-    assert dataset.videos == {"00002": [1, 3], "00007": [2, 4, 0]}  # in the order of time
+    assert dataset.videos() == {"00002": [1, 3], "00007": [2, 4, 0]}  # in the order of time
     for i in range(FRAMES):
         validate(dataset[i], BOX)
         np.testing.assert_array_equal(dataset[i].visibility, visibility[i].astype(np.float32))

@@ -154,9 +154,9 @@ def test_errors_stand_beside_the_papers_with_their_ratio(known, tmp_path, capsys
 def test_the_declared_symmetry_has_rows_of_its_own(tmp_path):
     """The second reading of a laptop's truth is wrong by far, and perfect up to symmetry."""
     dataset = write_videos(tmp_path / "laptop.h5", category=LAPTOP)
-    source = videos.Videos(LAPTOP, dataset, dataset.videos, "two videos")
+    source = videos.Videos(LAPTOP, dataset, dataset.videos(), "two videos")
     tracks = []
-    for name in dataset.videos:
+    for name in dataset.videos():
         truths = [frame.truth for frame in source.frames(name)]
         truth = jax.tree.map(lambda *rows: np.stack(rows), *truths)
         (equivalence,) = LAPTOP.equivalences
@@ -218,7 +218,7 @@ class TestModels:
 
         def draw(*arguments):
             asked.append(arguments)
-            return videos.Videos(LAPTOP, dataset, dataset.videos, "two videos")
+            return videos.Videos(LAPTOP, dataset, dataset.videos(), "two videos")
 
         monkeypatch.setattr(runs, "generated_videos", draw)
         config = TrackerConfig(registration=RegistrationConfig(gaussians=32))

@@ -320,7 +320,9 @@ class TestCorrected:
                 def corrected(static, points, tracked, state, due, doubted):
                     state, settings = SimpleNamespace(**state), TrackerConfig(**flags)
                     rest = due, doubted, LAPTOP, None, settings
-                    return keyframes.corrected(static, points, None, tracked, state, *rest)
+                    return keyframes.corrected(
+                        static, points, None, tracked, misfit(tracked, points), state, *rest
+                    )
 
                 programs[key] = quick_jit(corrected)
             points = in_camera(INSIDE, tracked if fits == "track" else static)

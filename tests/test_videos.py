@@ -178,7 +178,7 @@ def test_generate_writes_videos_that_read_back(tmp_path, capsys):
     dataset = Hdf5Dataset(path, "laptop", "test")
     assert len(dataset) == 12
     assert (dataset.names[0], dataset.names[-1]) == ("00000/000000", "00002/000003")
-    assert dataset.videos == {
+    assert dataset.videos() == {
         "00000": [0, 1, 2, 3],
         "00001": [4, 5, 6, 7],
         "00002": [8, 9, 10, 11],
@@ -188,7 +188,7 @@ def test_generate_writes_videos_that_read_back(tmp_path, capsys):
     for index in range(12):
         validate(dataset[index], LAPTOP)
         assert dataset[index].visibility.max() > 0.3
-    opening = [dataset[index].truth.joint_state[0] for index in dataset.videos["00001"]]
+    opening = [dataset[index].truth.joint_state[0] for index in dataset.videos()["00001"]]
     assert (np.diff(opening) > 0).all()
 
 

@@ -63,7 +63,7 @@ class KnownTracker:
         self._frames = {
             frame.points.tobytes(): frame for frame in map(dataset.__getitem__, range(len(dataset)))
         }
-        self._first = {dataset[index[0]].name for index in dataset.videos.values()}
+        self._first = {dataset[index[0]].name for index in dataset.videos().values()}
         self._degrees, self._share = degrees, share
         self.resets: list[bool] = []
         self.labels: list[bool] = []

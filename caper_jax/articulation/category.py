@@ -135,6 +135,11 @@ class Category:
         """[K-1] parent part of each joint."""
         return tuple(joint.parent for joint in self.joints)
 
+    @property
+    def state_units(self) -> np.ndarray:
+        """[K-1] network units per metre (prismatic joints), 1 (revolute ones)."""
+        return np.array([self.unit if t == "prismatic" else 1.0 for t in self.joint_types])
+
     def scaled(self, factor: float) -> Category:
         """The category of objects that are ``factor`` times as large; same networks, same weights.
 

@@ -88,6 +88,16 @@ def create_parser(
     )
 
 
+def add_splits(parser: argparse.ArgumentParser) -> None:
+    """The options of commands that read a labelled dataset."""
+    parser.add_argument("--split", help="split to read (default: all there is)")
+    parser.add_argument(
+        "--official-split",
+        action="store_true",
+        help="tell train from test by the published object ids, not by the lists of the root",
+    )
+
+
 def add_object_scale(parser: argparse.ArgumentParser) -> None:
     """The option of commands that load a model."""
     parser.add_argument(

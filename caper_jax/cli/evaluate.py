@@ -29,12 +29,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--data", required=True, type=Path, help="dataset's root folder or .h5")
     parser.add_argument("--format", required=True, help=f"layout of the data: {', '.join(FORMATS)}")
-    parser.add_argument("--split", help="split to read (default: all there is)")
-    parser.add_argument(
-        "--official-split",
-        action="store_true",
-        help="tell train from test by the published object ids, not by the lists of the root",
-    )
+    common.add_splits(parser)
     parser.add_argument(
         "--predictor",
         default="model",

@@ -177,17 +177,11 @@ def _write_file(arguments: argparse.Namespace) -> None:
         measure_visibility=True,
     )
     draw = _draw_videos if arguments.videos else _draw_frames
-    batch, fields, attributes = draw(category, config, arguments)
+    fields, attributes = draw(category, config, arguments)
     hdf5.write(
         arguments.out,
         category=category,
         split=arguments.split,
-        points=batch.points,
-        labels=batch.labels,
-        pose=batch.pose,
-        visible=batch.visible,
-        visibility=batch.visibility,
-        instance=batch.instance,
         **fields,
         attributes={
             "generator": __version__,
@@ -199,55 +193,32 @@ def _write_file(arguments: argparse.Namespace) -> None:
         },
         overwrite=arguments.overwrite,
     )
-    count = f"{len(batch.points)} frames of {arguments.points} points"
+    count = f"{len(fields['points'])} frames of {arguments.points} points"
     if arguments.videos:
         count = f"{arguments.videos} videos, {count}"
     print(f"written: {arguments.out} ({count})")
 
 
 def _draw_frames(category: Category, config: GeneratorConfig, arguments: argparse.Namespace):
-    """Single frames: a Batch [F, ...] of numpy arrays, their names, and nothing more to say."""
+    """Single frames: what ``hdf5.write`` is to be given, and nothing more to say."""
+    from caper_jax.data.synthetic.collect import collect
     from caper_jax.data.synthetic.scene import Generator
 
     generator = Generator(category, config, arguments.split, arguments.seed)
-    batch = _collect(generator.batch, arguments.seed, arguments.frames, BATCH)
+    batch = collect(generator.batch, arguments.seed, arguments.frames, BATCH)
     names = [
         f"{category.name}_{arguments.split}{instance:04d}_{index:06d}"
         for index, instance in enumerate(batch.instance)
     ]
-    return batch, {"names": names}, {}
+    return {**vars(batch), "names": names}, {}
 
 
 def _draw_videos(category: Category, config: GeneratorConfig, arguments: argparse.Namespace):
-    """Videos one after the other: a Batch [V T, ...], their names and numbers, and the mode."""
-    import jax
-    import numpy as np
-
+    """Videos one after the other: what ``hdf5.write`` is to be given, and the mode."""
+    from caper_jax.data.synthetic.collect import collect_videos
     from caper_jax.data.synthetic.videos import FRAMES as LENGTH
     from caper_jax.data.synthetic.videos import VideoGenerator
 
     mode, length = arguments.mode or "paper", arguments.frames_per_video or LENGTH
     generator = VideoGenerator(category, config, mode, length, arguments.split, arguments.seed)
-    batch = _collect(generator.batch, arguments.seed, arguments.videos, VIDEO_BATCH)
-    batch = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), batch)
-    video, frame = np.divmod(np.arange(arguments.videos * length), length)
-    names = [f"{v:05d}/{f:06d}" for v, f in zip(video, frame, strict=True)]
-    return batch, {"names": names, "video": video, "frame": frame}, {"mode": mode}
-
-
-def _collect(draw, seed: int, total: int, size: int):
-    """``total`` frames or videos as numpy arrays, drawn ``size`` at a time."""
-    import jax
-    import numpy as np
-
-    from caper_jax.progress import progress
-
-    key = jax.random.key(seed)
-    parts = []
-    with progress("generating", total=total) as bar:
-        for start in range(0, total, size):
-            count = min(size, total - start)
-            batch = draw(jax.random.fold_in(key, start), size)
-            parts.append(jax.tree.map(lambda array, n=count: np.asarray(array)[:n], batch))
-            bar.update(count)
-    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
+    return collect_videos(generator, arguments.seed, arguments.videos, VIDEO_BATCH), {"mode": mode}

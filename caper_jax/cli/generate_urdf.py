@@ -156,12 +156,7 @@ def write_urdf_frames(arguments: argparse.Namespace) -> None:
         arguments.out,
         category=category,
         split=arguments.split,
-        points=batch.points,
-        labels=batch.labels,
-        pose=batch.pose,
-        visible=batch.visible,
-        visibility=batch.visibility,
-        instance=batch.instance,
+        **vars(batch),
         names=[
             f"{category.name}_{objects[which].name}_{index:06d}"
             for index, which in enumerate(batch.instance)

@@ -62,12 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
         help=f"layout of the data: {', '.join(VIDEO_FORMATS)} (default: caper for .h5, folder for "
         "a folder with depth/)",
     )
-    parser.add_argument("--split", help="split to read (default: all there is)")
-    parser.add_argument(
-        "--official-split",
-        action="store_true",
-        help="tell train from test by the published object ids, not by the lists of the root",
-    )
+    common.add_splits(parser)
     parser.add_argument(
         "--depth-scale",
         type=common.positive_float,

@@ -83,8 +83,7 @@ def open_videos(
         dataset = open_dataset(
             layout, arguments.data, category, arguments.split, arguments.official_split
         )
-    found: Any = dataset.videos  # type: ignore[attr-defined]
-    videos: dict[str, list[int]] = found() if callable(found) else found
+    videos: dict[str, list[int]] = dataset.videos()  # type: ignore[attr-defined]
     if not videos:
         raise CaperError(
             f"{arguments.data}: holds single frames, no videos; measure them with caper evaluate"

@@ -188,7 +188,6 @@ class Hdf5Dataset:
         with _opened(path) as file:
             return [str(_read_attributes(path, file)["split"])]
 
-    @property
     def videos(self) -> dict[str, list[int]]:
         """Name of every video -> indices of its frames, in the order of time; {} for frames."""
         videos: dict[str, list[int]] = {}

@@ -130,19 +130,18 @@ def object_diagonal(pose: ArticulatedPose) -> np.ndarray:
     return np.linalg.norm(high.max(-2) - low.min(-2), axis=-1)
 
 
-def summarise_tracks(
-    tracks: Sequence[Track], category: Category, start: Start, mask_source: str, part_masks: str
-) -> dict[str, Any]:
-    """JSON-ready metrics over all frames of all videos but the first of each (Sec 6.3).
+def joined_tables(
+    errors: Sequence[PoseErrors], tracks: Sequence[Track], category: Category
+) -> dict[str, list[dict[str, Any]]]:
+    """``error_tables`` over all frames of all videos but the first of each.
+
+    Parts also have "translation_relative", see ``relative_translation``.
 
     Args:
-      tracks: at least one; all with ground truth.
+      errors: of each video.
+      tracks: of the same videos, with ground truth.
       category: theirs.
-      start: as given to ``track_video``.
-      mask_source: of the object masks.
-      part_masks: "predicted" or "given".
     """
-    errors = [track_errors(track, category) for track in tracks]
     joined = PoseErrors(
         **{
             key: np.concatenate([getattr(error, key)[1:] for error in errors])
@@ -159,6 +158,23 @@ def summarise_tracks(
     tables = error_tables(joined, category)
     for number, part in enumerate(tables["parts"]):
         part["translation_relative"] = summary(relative[:, number])
+    return tables
+
+
+def summarise_tracks(
+    tracks: Sequence[Track], category: Category, start: Start, mask_source: str, part_masks: str
+) -> dict[str, Any]:
+    """JSON-ready metrics over all frames of all videos but the first of each (Sec 6.3).
+
+    Args:
+      tracks: at least one; all with ground truth.
+      category: theirs.
+      start: as given to ``track_video``.
+      mask_source: of the object masks.
+      part_masks: "predicted" or "given".
+    """
+    errors = [track_errors(track, category) for track in tracks]
+    tables = joined_tables(errors, tracks, category)
     after = {
         key: np.concatenate([getattr(track, key)[1:] for track in tracks])
         for key in ("keyframe", "estimated", "lost", "seconds")
@@ -166,7 +182,7 @@ def summarise_tracks(
     return {
         "category": category.name,
         "videos": len(tracks),
-        "frames": len(relative),
+        "frames": len(after["lost"]),
         "start": start,
         "mask_source": mask_source,
         "part_masks": part_masks,

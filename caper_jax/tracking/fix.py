@@ -83,11 +83,10 @@ def estimate_fix(variables, points, labels, category: Category, network: Network
     unit = category.unit
     prediction = estimate(variables, points[None] / unit, category, network)
     pose = jax.tree.map(lambda array: array[0], prediction.pose)
-    length = jnp.array([unit if kind == "prismatic" else 1.0 for kind in category.joint_types])
     poses = se3.from_rt(pose.rotation, pose.translation * unit)
     return Fix(
         root=poses[0],
-        joint_state=pose.joint_state * length,
+        joint_state=pose.joint_state * category.state_units,
         parts=se3.compose(se3.inverse(poses[0]), poses),
         labels=jnp.where(labels >= 0, labels, prediction.labels[0]),
         constants=Constants(
@@ -122,13 +121,18 @@ def diagonal(constants: Constants):
     return jnp.maximum(linalg.norm(high - low), 1e-3)
 
 
+def own_coordinates(fix: Fix, points):
+    """Points [N, 3] of the camera's frame, each in the frame of its part."""
+    poses = se3.compose(fix.root, fix.parts)
+    return se3.act(se3.inverse(poses)[fix.labels], points[:, None])[:, 0]
+
+
 def misfit(fix: Fix, points):
     """Mean distance [] of points [N, 3] from the boxes of their parts, over the object's diagonal.
 
     The one thing in a pose that its own history cannot make look right: sizes are the category's.
     """
-    poses = se3.compose(fix.root, fix.parts)
-    own = se3.act(se3.inverse(poses)[fix.labels], points[:, None])[:, 0]
+    own = own_coordinates(fix, points)
     sizes, centers = fix.constants.size[fix.labels], fix.constants.center[fix.labels]
     outside = jnp.maximum(jnp.abs(own - centers) - sizes / 2, 0.0)
     return linalg.norm(outside).mean() / diagonal(fix.constants)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from caper_jax.geometry import linalg, se3, so3
 from caper_jax.tracking.config import TrackerConfig
-from caper_jax.tracking.fix import Fix, estimate_fix, misfit
+from caper_jax.tracking.fix import Fix, estimate_fix, misfit, own_coordinates
 from caper_jax.tracking.registration import (
     Surface,
     empty_surface,
@@ -47,6 +47,7 @@ def corrected(
     points,
     labels,
     tracked: Fix,
+    outside,
     state: TrackerState,
     due,
     doubted,
@@ -63,6 +64,7 @@ def corrected(
     Args:
       variables, points, labels, category, network: as for ``fix.measure``.
       tracked: the track's pose.
+      outside: [] the track's ``misfit`` in this frame.
       state: before this frame.
       due: [] bool, the policy wants a keyframe.
       doubted: [] bool, the last frames contradicted the track.
@@ -79,7 +81,7 @@ def corrected(
         lambda: estimate_fix(variables, points, labels, category, network),
         lambda: tracked,
     )
-    better = misfit(static, points) < _BETTER * misfit(tracked, points)
+    better = misfit(static, points) < _BETTER * outside
     replaced = state.lost | (doubted & better)
 
     static_variance = jnp.square(
@@ -129,9 +131,7 @@ def moved_cloud(key: Keyframe, fix: Fix):
 
 def grown_surface(surface: Surface, fix: Fix, points, config: TrackerConfig) -> Surface:
     """The surface with what a new keyframe shows of it for the first time."""
-    poses = se3.compose(fix.root, fix.parts)
-    own = se3.act(se3.inverse(poses)[fix.labels], points[:, None])[:, 0]
-    return extend_surface(surface, own, fix.labels, config.registration)
+    return extend_surface(surface, own_coordinates(fix, points), fix.labels, config.registration)
 
 
 def rebased_surface(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.estimator import SMALLEST_SIZE
 from caper_jax.geometry import se3
 from caper_jax.networks.caper import NetworkConfig
 from caper_jax.tracking.config import TrackerConfig
@@ -212,6 +213,7 @@ def track_step(
         points,
         frame.labels,
         tracked,
+        outside,
         state,
         due,
         doubted,
@@ -289,14 +291,15 @@ def _better_start(
 def _articulated_pose(state: TrackerState, category: Category) -> ArticulatedPose:
     """The pose in metres."""
     unit = category.unit
-    length = jnp.array([1 / unit if kind == "prismatic" else 1.0 for kind in category.joint_types])
     poses = se3.compose(state.root, state.parts)
     return ArticulatedPose(
         rotation=poses[:, :3, :3],
         translation=poses[:, :3, 3] / unit,
-        size=jnp.maximum(state.constants.size / unit, 0.01 * jnp.asarray(category.mean_size)),
+        size=jnp.maximum(
+            state.constants.size / unit, SMALLEST_SIZE * jnp.asarray(category.mean_size)
+        ),
         box_center=state.constants.center / unit,
         joint_axis=state.constants.axis,
         joint_pivot=state.constants.pivot / unit,
-        joint_state=state.joint_state * length,
+        joint_state=state.joint_state / category.state_units,
     )

@@ -137,7 +137,6 @@ class Task:
     def _targets(self, pose: ArticulatedPose, view) -> ArticulatedPose:
         """Ground truth in the viewing frame and network units."""
         unit = self.category.unit
-        length = jnp.array([unit if t == "prismatic" else 1.0 for t in self.category.joint_types])
         return ArticulatedPose(
             rotation=multiply(view[:, None], pose.rotation),
             translation=rotate(view, pose.translation) * unit,
@@ -145,7 +144,7 @@ class Task:
             box_center=(pose.box_center - self._mean_center) * unit,
             joint_axis=pose.joint_axis,
             joint_pivot=pose.joint_pivot * unit,
-            joint_state=pose.joint_state * length,
+            joint_state=pose.joint_state * self.category.state_units,
         )
 
     def _root_losses(self, output, truth: ArticulatedPose) -> dict[str, jax.Array]:

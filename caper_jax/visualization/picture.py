@@ -76,6 +76,15 @@ def write_picture(path: str | Path, scenes: Sequence[Scene]) -> Path:
         if row == 0:
             for axis, title in zip(axes, TITLES, strict=False):
                 axis.set_title(title, fontsize=12, color=INK, pad=8)
+    return save_figure(figure, path)
+
+
+def save_figure(figure: Figure, path: str | Path) -> Path:
+    """Writes a figure as PNG, and the folder it goes to.
+
+    Raises:
+      CaperError: a file that cannot be written.
+    """
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from caper_jax.articulation.category import Category
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.tracking import Track
-from caper_jax.visualization.picture import DPI, INK, PAPER, TRUTH, draw_estimate
+from caper_jax.visualization.picture import DPI, INK, PAPER, TRUTH, draw_estimate, save_figure
 from caper_jax.visualization.scene import Scene, format_state, joint_name, part_color
 
 MAX_TILES = 12
@@ -87,7 +87,7 @@ def write_sheet(path: str | Path, title: str, tiles: Sequence[Tile]) -> Path:
     heading = {"fontsize": 12, "fontweight": "bold", "color": INK, "parse_math": False}
     figure.suptitle(title, y=1 - 0.12 / height, va="top", **heading)
     _add_legend(figure, tiles[0].scene, any(tile.scene.truth is not None for tile in tiles))
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
 def _draw_tile(axes: Axes, tile: Tile) -> None:
@@ -156,7 +156,7 @@ def write_states(
     axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     axes[0].set_title(track.name, fontsize=12, fontweight="bold", color=INK, parse_math=False)
     figure.subplots_adjust(left=0.09, right=0.78, top=0.93, bottom=0.6 / figure.get_figheight())
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
 def _draw_states(axes: Axes, track: Track, category: Category, kind: str) -> None:
@@ -206,13 +206,3 @@ def _mark_frames(axes: Axes, track: Track) -> None:
     for frame in np.flatnonzero(track.lost).tolist():
         axes.axvspan(frame - 0.5, frame + 0.5, color=LOST, alpha=0.18, linewidth=0, zorder=0)
     axes.set_xlim(-0.5, len(track.frames) - 0.5)
-
-
-def _save(figure: Figure, path: str | Path) -> Path:
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=DPI, facecolor="white")
-    except OSError as error:
-        raise CaperError(f"cannot write {path}: {error.strerror or error}") from error
-    return path

@@ -6,8 +6,9 @@ frame is drawn by ``scene``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +24,8 @@ from caper_jax.errors import CaperError, unknown_name
 FRAMES = 30
 
 
-@dataclass(frozen=True)
-class Mode:
-    """How a video moves.
+class Mode(NamedTuple):
+    """How a video moves; traced, so that one compiled program serves all modes.
 
     Attributes:
       camera_speed: of the camera's arc, see ``camera.camera_arc``; 0 for a static camera.
@@ -33,9 +33,9 @@ class Mode:
       still: whether the joints stay where they are.
     """
 
-    camera_speed: float
-    reverses: bool
-    still: bool = False
+    camera_speed: float | jax.Array
+    reverses: bool | jax.Array
+    still: bool | jax.Array = False
 
 
 MODES = {
@@ -76,35 +76,27 @@ def video(
     Raises:
       CaperError: unknown mode, or less than two frames.
     """
-    return _video(key, instance, *_motion(mode, frames), category, config, frames)
+    return _video(key, instance, _motion(mode, frames), category, config, frames)
 
 
-def _motion(mode: str, frames: int):
-    """The traced arguments of a mode: camera's speed, whether joints reverse and stand still."""
+def _motion(mode: str, frames: int) -> Mode:
+    """A mode as arrays."""
     if mode not in MODES:
         raise unknown_name("video mode", mode, MODES)
     if frames < 2:
         raise CaperError(f"a video needs at least 2 frames, got {frames}")
-    moves = MODES[mode]
-    return jnp.float32(moves.camera_speed), jnp.asarray(moves.reverses), jnp.asarray(moves.still)
+    speed, reverses, still = MODES[mode]
+    return Mode(jnp.float32(speed), jnp.asarray(reverses), jnp.asarray(still))
 
 
-# The mode is traced, so that one compiled program serves all of them.
 @partial(jax.jit, static_argnames=("category", "config", "frames"))
 def _video(
-    key,
-    instance: Bank,
-    speed,
-    reverses,
-    still,
-    category: Category,
-    config: GeneratorConfig,
-    frames: int,
+    key, instance: Bank, motion: Mode, category: Category, config: GeneratorConfig, frames: int
 ) -> Batch:
     state_key, camera_key, arc_key, shared_key, frame_key = jax.random.split(key, 5)
     view, diagonal = category.viewpoint, rest_diagonal(instance)
-    states = _states(state_key, instance.limits, reverses, still, frames)
-    cameras = camera_arc(arc_key, draw_camera(camera_key, view), view, frames, speed)
+    states = _states(state_key, instance.limits, motion, frames)
+    cameras = camera_arc(arc_key, draw_camera(camera_key, view), view, frames, motion.camera_speed)
     shared = Keys(*jax.random.split(shared_key, len(Keys._fields)))
     mix = sensors.sensor_mix(config.noise)
 
@@ -123,9 +115,7 @@ def _video(
 def _batch(
     key,
     bank: Bank,
-    speed,
-    reverses,
-    still,
+    motion: Mode,
     category: Category,
     config: GeneratorConfig,
     frames: int,
@@ -136,24 +126,24 @@ def _batch(
     instances = jax.tree.map(lambda values: values[index], bank)
 
     def one(key, instance):
-        return _video(key, instance, speed, reverses, still, category, config, frames)
+        return _video(key, instance, motion, category, config, frames)
 
     batch = jax.vmap(one)(jax.random.split(rest, videos), instances)
     return replace(batch, instance=jnp.broadcast_to(index[:, None], (videos, frames)))
 
 
-def _states(key, limits, reverses, still, frames: int):
+def _states(key, limits, motion: Mode, frames: int):
     """Joint states [T, J] of a clip from the limits [J, 2]."""
     joints = limits.shape[0]
     uniform = jax.random.uniform(key, (frames + 3, joints))
     first, last, turn, steps = uniform[0], uniform[1], uniform[2], 0.5 + uniform[3:]
     passed = jnp.cumsum(steps, axis=0)
     share = (passed - passed[:1]) / (passed[-1:] - passed[:1])  # from 0 to 1
-    share = jnp.where(still, turn, share)
+    share = jnp.where(motion.still, turn, share)
     # There and back: up to the turn, drawn for each joint around the middle, then down again.
     turn = 0.4 + 0.2 * turn
     there_and_back = jnp.minimum(share / turn, (1.0 - share) / (1.0 - turn))
-    share = jnp.where(reverses, there_and_back, share)
+    share = jnp.where(motion.reverses, there_and_back, share)
     share = 0.35 * first + share * (0.65 + 0.35 * last - 0.35 * first)
     return limits[:, 0] + share * (limits[:, 1] - limits[:, 0])
 
@@ -207,4 +197,4 @@ class VideoGenerator:
           Batch with leading axes [V, T] everywhere.
         """
         settings = (self.category, self.config, self.frames)
-        return _batch(key, self.bank, *self._motion, *settings, videos)
+        return _batch(key, self.bank, self._motion, *settings, videos)

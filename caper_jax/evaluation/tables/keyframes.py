@@ -92,12 +92,10 @@ def run(name: str, options: Options) -> Report:
 
 def _measure(name: str, options: Options, videos: int, frames: int) -> dict[str, Any]:
     """All policies of one category, JSON-ready; "data" says why there are none."""
-    estimator = runs.find_model(name, options.weights)
-    if estimator is None:
-        return {"data": runs.NO_MODEL, "policies": {}}
-    source = runs.open_videos(options, estimator.category, videos, frames)
-    if source is None:
-        return {"data": runs.NO_DATA, "policies": {}}
+    case = runs.find_case(name, options, videos, frames)
+    if isinstance(case, str):
+        return {"data": case, "policies": {}}
+    estimator, source = case
     found, condition = {}, runs.Condition()
     for policy in POLICIES:
         tracker = Tracker(estimator, policy_config(policy, estimator, options))

@@ -13,13 +13,13 @@ from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load, shipped_weights
-from caper_jax.evaluation.metrics import PART_METRICS, PoseErrors, pose_errors_up_to_symmetry
-from caper_jax.evaluation.report import summary
+from caper_jax.evaluation.metrics import pose_errors_up_to_symmetry
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.videos import SPLIT, Videos, dataset_videos, generated_videos
 from caper_jax.evaluation.tracking import (
     Start,
     Track,
+    joined_tables,
     object_diagonal,
     summarise_tracks,
     track_video,
@@ -162,6 +162,25 @@ def open_videos(
     return dataset_videos(options.format, options.data, category, split, options.videos)
 
 
+def find_case(
+    name: str, options: Options, videos: int, frames: int
+) -> tuple[Estimator, Videos] | str:
+    """The model of a category and the videos to measure it on, or why there are none.
+
+    Args:
+      name: of the category.
+      options, videos, frames: see ``open_videos``.
+
+    Raises:
+      CaperError: see ``find_model`` and ``open_videos``.
+    """
+    estimator = find_model(name, options.weights)
+    if estimator is None:
+        return NO_MODEL
+    source = open_videos(options, estimator.category, videos, frames)
+    return NO_DATA if source is None else (estimator, source)
+
+
 def track_all(tracker: Tracker, videos: Videos, condition: Condition) -> list[Track]:
     """Tracks through every video."""
     tracks = []
@@ -189,28 +208,16 @@ def summarise(tracks: Sequence[Track], videos: Videos, condition: Condition) -> 
     category, mask_source = videos.category, videos.dataset.mask_source
     arguments = (category, condition.start, mask_source, condition.part_masks)
     found = summarise_tracks(tracks, *arguments)
-    pairs = [(track.pose, track.truth) for track in tracks if track.truth is not None]
-    diagonals = [object_diagonal(truth) for _, truth in pairs]
+    truths = [track.truth for track in tracks if track.truth is not None]
+    diagonals = [object_diagonal(truth) for truth in truths]
     found["mean_diagonal_m"] = float(np.concatenate(diagonals).mean())
     if category.equivalences:
-        errors = [pose_errors_up_to_symmetry(pose, truth, category) for pose, truth in pairs]
-        relative = [e.translation_m / d[:, None] for e, d in zip(errors, diagonals, strict=True)]
+        errors = [
+            pose_errors_up_to_symmetry(track.pose, truth, category)
+            for track, truth in zip(tracks, truths, strict=True)
+        ]
         found["up_to_symmetry"] = {
             "reasons": [equivalence.reason for equivalence in category.equivalences],
-            "parts": _part_means(errors, relative, category),
+            "parts": joined_tables(errors, tracks, category)["parts"],
         }
     return found
-
-
-def _part_means(
-    errors: Sequence[PoseErrors], relative: Sequence[np.ndarray], category: Category
-) -> list[dict[str, Any]]:
-    """Mean and median of the parts' errors over the videos, each without its first frame."""
-    values = {
-        key: np.concatenate([getattr(error, key)[1:] for error in errors]) for key in PART_METRICS
-    }
-    values["translation_relative"] = np.concatenate([share[1:] for share in relative])
-    return [
-        {"name": part, **{key: summary(value[:, k]) for key, value in values.items()}}
-        for k, part in enumerate(category.parts)
-    ]

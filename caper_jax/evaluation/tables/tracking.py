@@ -62,12 +62,10 @@ def run(name: str, options: Options) -> Report:
 
 def _measure(name: str, options: Options, videos: int, frames: int) -> dict[str, Any]:
     """All runs of one category, JSON-ready; "missing" says why there are none."""
-    estimator = runs.find_model(name, options.weights)
-    if estimator is None:
-        return {"missing": runs.NO_MODEL, "runs": []}
-    source = runs.open_videos(options, estimator.category, videos, frames)
-    if source is None:
-        return {"missing": runs.NO_DATA, "runs": []}
+    case = runs.find_case(name, options, videos, frames)
+    if isinstance(case, str):
+        return {"missing": case, "runs": []}
+    estimator, source = case
     tracker = Tracker(estimator, runs.tracker_config(estimator, options))
     found = []
     for condition in runs.conditions(options):

@@ -8,17 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from caper_jax._version import __version__
 from caper_jax.articulation.category import Category
 from caper_jax.data import categories_in, hdf5, open_dataset
 from caper_jax.data.schema import Dataset, Frame
+from caper_jax.data.synthetic.collect import collect_videos
 from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.data.synthetic.videos import MODES, VideoGenerator
 from caper_jax.errors import CaperError
-from caper_jax.progress import progress
 
 # The paper's clouds have 1,024 points; its sensor noise is not stated.
 TEST_DATA = GeneratorConfig(instances=100, grid=128, num_points=1024, noise=("kinect",))
@@ -92,7 +91,7 @@ def generated_videos(
     return Videos(
         category,
         kept,
-        kept.videos,
+        kept.videos(),
         f"{videos} generated videos of {frames} frames, mode {mode}{stands}, noise {noise}, "
         f"seed {seed}, "
         "of test instances, which training never shows",
@@ -115,8 +114,7 @@ def dataset_videos(
     if category.name not in categories_in(format, root):
         return None
     dataset = open_dataset(format, root, category.name, split)
-    found = getattr(dataset, "videos", {})
-    index: dict[str, list[int]] = found() if callable(found) else found
+    index: dict[str, list[int]] = getattr(dataset, "videos", dict)()
     if not index:
         raise CaperError(f"{root}: {format} holds single frames, no videos, of {category.name}")
     index = dict(list(index.items())[:videos])
@@ -127,30 +125,13 @@ def dataset_videos(
 
 def _draw(path: Path, generator: VideoGenerator, videos: int, seed: int, attributes) -> None:
     """Draws the videos and writes them to a file."""
-    key = jax.random.key(seed)
-    batches = []
-    with progress(f"generating {generator.category.name} videos", total=videos) as bar:
-        for start in range(0, videos, _BATCH):
-            count = min(_BATCH, videos - start)
-            batch = generator.batch(jax.random.fold_in(key, start), _BATCH)
-            batches.append(jax.tree.map(lambda array, n=count: np.asarray(array)[:n], batch))
-            bar.update(count)
-    batch = jax.tree.map(
-        lambda *arrays: np.concatenate(arrays).reshape(-1, *arrays[0].shape[2:]), *batches
-    )
-    video, frame = np.divmod(np.arange(len(batch.points)), generator.frames)
+    category = generator.category
+    title = f"generating {category.name} videos"
     hdf5.write(
         path,
-        category=generator.category,
+        category=category,
         split=SPLIT,
-        points=batch.points,
-        labels=batch.labels,
-        pose=batch.pose,
-        visible=batch.visible,
-        instance=batch.instance,
-        names=[f"{v:05d}/{f:06d}" for v, f in zip(video, frame, strict=True)],
-        video=video,
-        frame=frame,
+        **collect_videos(generator, seed, videos, _BATCH, title),
         attributes=attributes,
         overwrite=True,
     )

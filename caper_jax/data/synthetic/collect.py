@@ -1,0 +1,53 @@
+"""Many generated frames or videos, drawn a few at a time, as arrays for a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from caper_jax.data.synthetic.scene import Batch
+from caper_jax.data.synthetic.videos import VideoGenerator
+from caper_jax.progress import progress
+
+
+def collect(
+    draw: Callable[[Any, int], Batch], seed: int, total: int, size: int, title: str = "generating"
+) -> Batch:
+    """``total`` frames or videos as numpy arrays.
+
+    Args:
+      draw: (key, count) -> Batch, e.g. ``Generator.batch``.
+      seed: of all keys.
+      total: how many.
+      size: drawn at a time; the same seed and size give the same frames.
+      title: of the progress display.
+    """
+    key = jax.random.key(seed)
+    parts = []
+    with progress(title, total=total) as bar:
+        for start in range(0, total, size):
+            count = min(size, total - start)
+            batch = draw(jax.random.fold_in(key, start), size)
+            parts.append(jax.tree.map(lambda array, n=count: np.asarray(array)[:n], batch))
+            bar.update(count)
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
+
+
+def collect_videos(
+    generator: VideoGenerator, seed: int, videos: int, size: int, title: str = "generating"
+) -> dict[str, Any]:
+    """Videos one after the other, as the arguments of ``hdf5.write`` that they decide.
+
+    Args:
+      generator: draws them.
+      seed, size, title: see ``collect``.
+      videos: V.
+    """
+    batch = collect(generator.batch, seed, videos, size, title)
+    batch = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), batch)
+    video, frame = np.divmod(np.arange(len(batch.points)), generator.frames)
+    names = [f"{v:05d}/{f:06d}" for v, f in zip(video, frame, strict=True)]
+    return {**vars(batch), "names": names, "video": video, "frame": frame}
