@@ -170,7 +170,7 @@ def test_neighbours_shrink_with_the_cloud(monkeypatch, points, expected):
 
 
 def test_parameter_count_of_the_paper_preset():
-    """About 9.5 M in stage I, 11.6 M in stage II, from the layer sizes alone."""
+    """About 9.5 M in stage I, 13.8 M in stage II, from the layer sizes alone."""
 
     def hs(before, channels, norm):
         own = 3 * 7 * channels + before * channels  # directions and STE
@@ -192,11 +192,11 @@ def test_parameter_count_of_the_paper_preset():
     box = categories.get("box")
     root = encoder + 2 * head(4) + head(3, extra=3)
     pointwise = head(2, 3, pooled=False) + head(7, 3, pooled=False)
-    parts = encoder + pointwise + head(1) + head(12)
+    parts = encoder + pointwise + head(1) + head(12) + head(6)
     sizes = preset("paper")
     modules = (RootNetwork(sizes), PartsNetwork(sizes, box.num_parts))
     for module, expected in zip(modules, (root, parts), strict=True):
         leaves = jax.tree.leaves(shapes_of(module, 1024)["params"])
         assert sum(math.prod(leaf.shape) for leaf in leaves) == expected
     assert 9e6 < root < 10e6
-    assert 11e6 < parts < 12e6
+    assert 13e6 < parts < 14e6

@@ -14,6 +14,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.kinematics import forward_kinematics
+from caper_jax.errors import CaperError
 from caper_jax.geometry import se3
 from caper_jax.networks.graph import smallest
 from caper_jax.tracking import registration
@@ -196,6 +197,23 @@ class TestSurface:
             near = np.abs(np.asarray(surface.mean) - place).max(1) < 0.6
             np.testing.assert_array_equal(near, np.arange(64) // 32 == number % 2)
         np.testing.assert_array_equal(surface.labels, np.repeat([0, 1], 32))
+
+    def test_every_region_of_a_cloud_counts(self):
+        """Also where the number of points is no multiple of that of Gaussians."""
+        points = np.float32(plane(np.random.default_rng(6), 1000))
+        order = np.argsort(points[:, 0])
+        surface = extend(empty_surface(CONFIG), points[order], np.zeros(1000, np.int32), CONFIG)
+        assert surface.added == 256
+        covered = np.asarray(surface.mean[:256, 0])
+        assert covered.max() > points[:, 0].max() - CONFIG.window
+        few = extend(empty_surface(CONFIG), points[:100], np.zeros(100, np.int32), CONFIG)
+        assert few.added == 100
+
+    def test_more_gaussians_than_room_are_refused(self):
+        with pytest.raises(CaperError, match=r"gaussians = 65 must be .* at most .*capacity = 64"):
+            RegistrationConfig(gaussians=65, capacity=64)
+        with pytest.raises(CaperError, match="stride 1 or more"):
+            RegistrationConfig(stride=0)
 
     def test_parts_never_mix(self):
         """Two sheets, a fraction of the window apart."""

@@ -14,6 +14,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from caper_jax import cli
 from caper_jax.configuration import update
+from caper_jax.errors import CaperError
 from caper_jax.model_files import read_model
 from caper_jax.training import run
 
@@ -134,6 +135,23 @@ def test_a_model_can_start_another_run(model, tmp_path):
         )
     ]
     assert 0 < max(moved) < 0.1
+
+
+def test_a_model_of_another_category_gives_what_fits():
+    def variables(outputs, width, fill):
+        sizes = {"encoder": (3, width), "state": (width, 4), "size": (4, outputs)}
+        layers = {name: np.full(shape, fill, np.float32) for name, shape in sizes.items()}
+        return {"params": {"parts": {name: {"kernel": k} for name, k in layers.items()}}}
+
+    begin, stored = variables(6, 5, 0.0), variables(3, 5, 1.0)
+    start = run.initial_variables(begin, stored, "there", same_category=False)
+    parts = start["params"]["parts"]
+    np.testing.assert_array_equal(parts["encoder"]["kernel"], 1.0)
+    np.testing.assert_array_equal(parts["state"]["kernel"], 1.0)
+    np.testing.assert_array_equal(parts["size"]["kernel"], np.zeros((4, 6)))
+    for other, same in ((variables(6, 7, 1.0), False), (stored, True)):
+        with pytest.raises(CaperError, match="there: its weights are of another network"):
+            run.initial_variables(begin, other, "there", same_category=same)
 
 
 def test_a_model_of_another_network_cannot(model, tmp_path, capsys):

@@ -49,7 +49,8 @@ def build_parser() -> argparse.ArgumentParser:
         type=Path,
         dest="initial",
         metavar="DIR",
-        help="start from the weights of this model instead of random ones",
+        help="start from the weights of this model instead of random ones; one of another "
+        "category gives its encoders and what fits of its heads",
     )
     parser.add_argument(
         "--data",

@@ -107,7 +107,9 @@ def corrected(
         constants=tracked.constants,
     )
     fix = select(replaced, static, fused)
-    variance = jnp.where(replaced, static_variance, (1.0 - gain) * grown)
+    # (1 - gain) grown, which would cancel where the gain is nearly one.
+    left = jnp.where(gain > 0, gain * static_variance, grown)
+    variance = jnp.where(replaced, static_variance, left)
     return fix, variance, asked, replaced
 
 

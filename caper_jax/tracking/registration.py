@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from caper_jax.articulation.joints import joint_transforms
+from caper_jax.errors import CaperError
 from caper_jax.geometry import linalg, se3
 from caper_jax.networks.graph import gather, smallest, squared_distances
 
@@ -66,6 +67,15 @@ class RegistrationConfig:
     network_translation: float = 0.05
     network_joint: float = 0.05
     hold: float = 30.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.gaussians <= self.capacity:
+            raise CaperError(
+                f"registration.gaussians = {self.gaussians} must be 1 or more, and at most "
+                f"registration.capacity = {self.capacity}"
+            )
+        if self.steps < 0 or self.stride < 1:
+            raise CaperError("registration.steps must be 0 or more, registration.stride 1 or more")
 
 
 @flax.struct.dataclass
@@ -150,8 +160,9 @@ def extend_surface(surface: Surface, points, labels, config: RegistrationConfig)
       labels: [N] int32.
       config: sizes.
     """
-    stride = max(1, points.shape[0] // config.gaussians)
-    centers, kinds = points[::stride][: config.gaussians], labels[::stride][: config.gaussians]
+    count = min(config.gaussians, points.shape[0])
+    chosen = np.arange(count) * points.shape[0] // count  # evenly, the last ones too
+    centers, kinds = points[chosen], labels[chosen]
     squared = squared_distances(centers[None], points[None])[0]
     weight = jnp.exp(-0.5 * squared / config.window**2) * (kinds[:, None] == labels)
     x, y, z = points.T

@@ -22,7 +22,7 @@ from caper_jax.data import open_dataset
 from caper_jax.data.loader import LabelledClouds, Loader, LoaderConfig
 from caper_jax.data.synthetic.scene import Batch, Generator, GeneratorConfig
 from caper_jax.errors import CaperError, unknown_name
-from caper_jax.model_files import flatten, read_model, write_model
+from caper_jax.model_files import flatten, read_model, unflatten, write_model
 from caper_jax.networks.caper import NetworkConfig
 from caper_jax.networks.presets import PRESETS as NETWORKS
 from caper_jax.training import parallel
@@ -112,7 +112,8 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
       directory: gets config.json, metrics.jsonl, checkpoints/ and, once the budget is used up,
         weights.npz and model.json.
       initial: model directory whose weights the run starts from (its card is kept in the new
-        one); by default the weights are random.
+        one); by default the weights are random. A model of another category gives its encoders
+        and what fits of its heads.
 
     Raises:
       CaperError: see ``training.loop.fit``.
@@ -125,7 +126,8 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
     variables, started_from = task.init(jax.random.key(config.training.seed)), None
     if initial is not None:
         started_from, stored = read_model(initial)
-        variables = _initial_variables(variables, stored, initial)
+        same = started_from.get("category") == category.name
+        variables = initial_variables(variables, stored, initial, same)
         description["initial"] = started_from
     mesh = _mesh(config.training.batch_size)
     fit_task = partial(
@@ -195,16 +197,31 @@ def _mesh(batch_size: int) -> jax.sharding.Mesh | None:
     return parallel.data_mesh(devices) if len(devices) > 1 else None
 
 
-def _initial_variables(template: Any, stored: Any, directory: str | Path) -> Any:
-    """Stored weights in the place of random ones; CaperError where they do not fit."""
+def initial_variables(
+    template: Any, stored: Any, directory: str | Path, same_category: bool
+) -> Any:
+    """Stored weights in the place of random ones; CaperError where they do not fit.
+
+    From a model of another category the encoders are taken, and every layer of the heads that has
+    the shape of this category's; the other layers keep their random weights.
+    """
     wanted, found = flatten(template), flatten(stored)
-    shapes = {name: np.shape(leaf) for name, leaf in wanted.items()}
-    if shapes != {name: np.shape(leaf) for name, leaf in found.items()}:
+    fits = {
+        name
+        for name, leaf in wanted.items()
+        if name in found and np.shape(found[name]) == np.shape(leaf)
+    }
+    needed = [name for name in wanted if same_category or "/encoder/" in name]
+    if not fits.issuperset(needed) or (same_category and found.keys() != wanted.keys()):
         raise CaperError(
             f"{directory}: its weights are of another network than this run's; use the same "
-            "category, preset and network settings"
+            "preset and network settings"
         )
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), stored)
+    start = {
+        name: jnp.asarray(found[name] if name in fits else leaf, jnp.float32)
+        for name, leaf in wanted.items()
+    }
+    return unflatten(start)
 
 
 def mean_pose(batch: Batch | LabelledClouds) -> dict[str, Any]:
