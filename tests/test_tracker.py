@@ -179,7 +179,8 @@ def toy(variables=None) -> Tracker:
 def test_scans_loops_vmaps_and_slopes():
     """In float64: a scan of each of two videos is a loop over both, with slopes as differences say.
 
-    Slopes along two directions of one frame's cloud, and along one of the weights.
+    Slopes in reverse through ten frames, of weighted sums of all poses of a video, with respect to
+    one frame's cloud and to the weights, along two directions of the one and one of the other.
     """
     rng = np.random.default_rng(1)
     frames, moved, away = 11, 4, 6
@@ -191,14 +192,13 @@ def test_scans_loops_vmaps_and_slopes():
         begin = tracker.initial_state()
         variables = jax.tree.map(lambda leaf: np.asarray(leaf, float), tracker.estimator.variables)
 
-        def through(params, cloud, video):
-            """A video, one cloud of which is another."""
+        def weighed(params, cloud, video, weights):
+            """A video, one cloud of which is another: what is found, as one number and whole."""
             observations = Observation(video.at[moved].set(cloud), present, labels)
-            return toy(variables | {"params": params}).track(observations, begin)
+            found = toy(variables | {"params": params}).track(observations, begin)
+            return sum((weights[name] * getattr(found.pose, name)).sum() for name in weights), found
 
-        @jax.jit
-        def differentiate(here, along, video):
-            return jax.jvp(partial(through, video=video), here, along)
+        differentiate = jax.jit(jax.grad(weighed, argnums=(0, 1), has_aux=True))
 
         def directed(leaf):
             direction = rng.normal(size=leaf.shape)
@@ -207,27 +207,37 @@ def test_scans_loops_vmaps_and_slopes():
         def moved_by(size, leaf, direction):
             return leaf + size * direction
 
-        def check(way, here):
-            _, slopes = differentiate(here, way, clouds[0])
+        here = variables["params"], clouds[0, moved]
+        pose = jax.eval_shape(partial(weighed, weights={}), *here, clouds[0])[1].pose
+        names = ("rotation", "translation", "joint_state", "size")
+        nothing = {name: np.zeros(getattr(pose, name).shape) for name in names}
+        still = jax.tree.map(np.zeros_like, here)
+        weights = jax.tree.map(directed, nothing)
+
+        def check(way):
             ahead, behind = (
-                differentiate(jax.tree.map(partial(moved_by, size), here, way), still, clouds[0])[0]
+                differentiate(*jax.tree.map(partial(moved_by, size), here, way), clouds[0], nothing)
                 for size in (1e-6, -1e-6)
             )
-            for name in ("rotation", "translation", "joint_state", "size"):
-                one, two = (getattr(found.pose, name) for found in (ahead, behind))
-                slope, numeric = getattr(slopes.pose, name), (one - two) / 2e-6
-                scale = np.abs(numeric).max()
+            for name in names:
+                slopes, _ = differentiate(*here, clouds[0], nothing | {name: weights[name]})
+                slope = sum(
+                    (one * two).sum()
+                    for one, two in zip(*map(jax.tree.leaves, (slopes, way)), strict=True)
+                )
+                one, two = (getattr(found.pose, name) for _, found in (ahead, behind))
+                numeric = (weights[name] * (one - two)).sum() / 2e-6
+                scale = np.abs(one - two).max() / 2e-6
                 np.testing.assert_allclose(slope, numeric, rtol=1e-3, atol=1e-4 * scale)
             # What changes in one frame is still felt in the last.
-            assert np.abs(slopes.pose.translation[-1, -1]).max() > 1e-4
+            last = [found.pose.translation[-1, -1] for _, found in (ahead, behind)]
+            assert np.abs(last[0] - last[1]).max() > 2e-10
 
-        here = variables["params"], clouds[0, moved]
-        still = jax.tree.map(np.zeros_like, here)
-        check((still[0], directed(here[1])), here)
-        check((still[0], directed(here[1])), here)
-        check((jax.tree.map(directed, here[0]), still[1]), here)
+        check((still[0], directed(here[1])))
+        check((still[0], directed(here[1])))
+        check((jax.tree.map(directed, here[0]), still[1]))
 
-        scans = [differentiate((here[0], video[moved]), still, video)[0] for video in clouds]
+        scans = [differentiate(here[0], video[moved], video, nothing)[1] for video in clouds]
         scans = jax.tree.map(lambda *leaves: np.stack(leaves), *scans)
         assert scans.keyframe.sum() > 4 and scans.estimated.sum() > 4
         np.testing.assert_array_equal(scans.lost, [~present] * 2)
