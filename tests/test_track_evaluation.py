@@ -10,9 +10,8 @@ from frames import random_pose
 from tracks import BOX, KnownTracker, disturbed, track, write_videos
 
 from caper_jax.errors import CaperError
+from caper_jax.evaluation.metrics import object_diagonal
 from caper_jax.evaluation.tracking import (
-    object_diagonal,
-    relative_translation,
     summarise_tracks,
     track_errors,
     track_video,
@@ -82,7 +81,7 @@ def test_lengths_are_relative_to_the_whole_object_at_rest():
     found = track("a", truth, disturbed(truth, share=0.1))
     errors = track_errors(found, BOX)
     np.testing.assert_allclose(errors.translation_m, 0.1 * span, rtol=1e-4)
-    np.testing.assert_allclose(relative_translation(errors, truth), 0.1, rtol=1e-4)
+    np.testing.assert_allclose(errors.translation_relative, 0.1, rtol=1e-4)
     assert summary([found])["parts"][1]["translation_relative"]["mean"] == pytest.approx(
         0.1, rel=1e-4
     )

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
 from caper_jax.data import hdf5
-from caper_jax.evaluation.tracking import Track, object_diagonal
+from caper_jax.evaluation.metrics import object_diagonal
+from caper_jax.evaluation.tracking import Track
 from caper_jax.tracking.step import Tracked
 
 BOX = categories.get("box")

@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from caper_jax.errors import CaperError
 
@@ -98,18 +98,6 @@ def add_splits(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_object_scale(parser: argparse.ArgumentParser) -> None:
-    """The option of commands that load a model."""
-    parser.add_argument(
-        "--object-scale",
-        type=positive_float,
-        default=1.0,
-        metavar="S",
-        help="the objects are S times as large as those the model was trained on, e.g. 3.7 for the "
-        "laptops of PM-Videos and ArtImage (PartNet units read as metres)",
-    )
-
-
 def check_folder(folder: Path, argument: str) -> None:
     """Refuses, before any work, a folder that cannot be made or written in.
 
@@ -138,6 +126,20 @@ def non_negative_int(text: str) -> int:
 def positive_float(text: str) -> float:
     """Argument type: a finite number above 0."""
     return _checked(float, text, "a number above 0", lambda value: 0 < value < math.inf)
+
+
+OBJECT_SCALE: dict[str, Any] = {
+    "type": positive_float,
+    "default": 1.0,
+    "metavar": "S",
+    "help": "the objects are S times as large as those the model was trained on, e.g. 3.7 for the "
+    "laptops of PM-Videos and ArtImage (PartNet units read as metres)",
+}
+
+
+def add_object_scale(parser: argparse.ArgumentParser) -> None:
+    """The option of commands that load a model."""
+    parser.add_argument("--object-scale", **OBJECT_SCALE)
 
 
 def pixel_box(text: str) -> tuple[float, float, float, float]:

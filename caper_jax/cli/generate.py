@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from caper_jax.data.synthetic.config import GeneratorConfig
 
 FRAMES = 1000
-BATCH = 25
 VIDEO_BATCH = 4
 
 
@@ -201,16 +200,11 @@ def _write_file(arguments: argparse.Namespace) -> None:
 
 def _draw_frames(category: Category, config: GeneratorConfig, arguments: argparse.Namespace):
     """Single frames: what ``hdf5.write`` is to be given, and nothing more to say."""
-    from caper_jax.data.synthetic.collect import collect
+    from caper_jax.data.synthetic.collect import collect_frames
     from caper_jax.data.synthetic.scene import Generator
 
     generator = Generator(category, config, arguments.split, arguments.seed)
-    batch = collect(generator.batch, arguments.seed, arguments.frames, BATCH)
-    names = [
-        f"{category.name}_{arguments.split}{instance:04d}_{index:06d}"
-        for index, instance in enumerate(batch.instance)
-    ]
-    return {**vars(batch), "names": names}, {}
+    return collect_frames(generator, arguments.seed, arguments.frames), {}
 
 
 def _draw_videos(category: Category, config: GeneratorConfig, arguments: argparse.Namespace):

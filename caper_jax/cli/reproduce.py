@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 
 _TRACKING = (
     *("category", "videos", "frames", "mode", "data", "format", "split", "weights", "seed"),
-    "network_alone",
+    *("network_alone", "object_scale"),
 )
+_STATIC = ("category", "frames", "data", "format", "split", "weights", "seed", "object_scale")
 _MOVING = ("category", "videos", "frames", "weights", "seed", "network_alone")
 
 
@@ -40,6 +41,10 @@ class Reproduction:
 
 
 REPRODUCTIONS = {
+    "table1": Reproduction("static", "pose estimation, ArtImage categories", _STATIC),
+    "table2": Reproduction("static", "pose estimation, ReArtMix categories", _STATIC),
+    "table3": Reproduction("static", "pose estimation, seven parts of an arm", _STATIC),
+    "table8": Reproduction("occlusion", "pose estimation by how much is hidden", _STATIC),
     "table4": Reproduction(
         "tracking", "pose tracking, ReArt-Videos categories", (*_TRACKING, "given_masks")
     ),
@@ -83,7 +88,8 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
         {
             "type": common.positive_int,
             "metavar": "T",
-            "help": "of each generated video (default: the paper's)",
+            "help": "of each video, or of a test set of single frames (default: the paper's, or "
+            "1,000)",
         },
     ),
     "mode": (
@@ -107,12 +113,13 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
             "help": "model directory, or folder with one per category (default: the shipped ones)",
         },
     ),
+    "object_scale": ("--object-scale", common.OBJECT_SCALE),
     "seed": (
         "--seed",
         {
             "type": common.non_negative_int,
             "default": 0,
-            "help": "of generated videos (default: %(default)s)",
+            "help": "of generated frames and videos (default: %(default)s)",
         },
     ),
     "given_masks": (
@@ -159,6 +166,8 @@ def build_parser() -> argparse.ArgumentParser:
         "Measures what a table of the paper shows and prints the paper's figures, ours, and what\n"
         "ours were measured on. Writes the same as markdown and JSON, and pictures of curves.",
         [
+            ("table1", "single frames, all categories of the table"),
+            ("table1 --data ROOT --format artimage --object-scale 3.7", "on the paper's data"),
             ("table6 --category laptop", "one category, on generated videos"),
             ("table6 --data PM-Videos --format pm-videos", "on the paper's data"),
             ("table10 --weights runs/arm --frames 1000", "errors against frame, long videos"),

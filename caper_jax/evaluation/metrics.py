@@ -24,6 +24,7 @@ FAILED_ROTATION_DEG = 180.0
 FAILURE_VALUES = {
     "rotation_deg": FAILED_ROTATION_DEG,
     "translation_m": "distance of the true part origin from the camera",
+    "translation_relative": "the same, over the diagonal of the object",
     "iou_full": 0.0,
     "iou_size": 0.0,
     "axis_deg": FAILED_ROTATION_DEG,
@@ -39,6 +40,7 @@ class PoseErrors:
     Attributes:
       rotation_deg: [F, K] geodesic angle, never folded.
       translation_m: [F, K] distance of the part origins.
+      translation_relative: [F, K] the same over the true ``object_diagonal``.
       iou_full: [F, K] IoU of the oriented boxes in the camera frame.
       iou_size: [F, K] IoU of the boxes' sizes alone, as if they shared centre and rotation.
       axis_deg: [F, J] angle of the joint axes in the root's frame; the sign counts.
@@ -48,6 +50,7 @@ class PoseErrors:
 
     rotation_deg: np.ndarray
     translation_m: np.ndarray
+    translation_relative: np.ndarray
     iou_full: np.ndarray
     iou_size: np.ndarray
     axis_deg: np.ndarray
@@ -55,7 +58,7 @@ class PoseErrors:
     state: np.ndarray
 
 
-PART_METRICS = ("rotation_deg", "translation_m", "iou_full", "iou_size")
+PART_METRICS = ("rotation_deg", "translation_m", "translation_relative", "iou_full", "iou_size")
 JOINT_METRICS = ("axis_deg", "pivot_m", "state")
 
 
@@ -95,6 +98,7 @@ def pose_errors(
     errors["pivot_m"][lost] = np.where(revolute, _axis_distance(true), np.nan)[lost]
     widths = np.array([joint.limits[1] - joint.limits[0] for joint in category.joints])
     errors["state"][lost] = np.where(revolute, np.degrees(widths), widths)
+    errors["translation_relative"] = errors["translation_m"] / object_diagonal(truth)[:, None]
     return PoseErrors(**errors)
 
 
@@ -121,6 +125,13 @@ def pose_errors_up_to_symmetry(
             for field in fields(PoseErrors)
         }
     )
+
+
+def object_diagonal(pose: ArticulatedPose) -> np.ndarray:
+    """[F] metres, diagonal of the box around all parts at rest."""
+    half = np.asarray(pose.size, np.float64) / 2
+    center = np.asarray(pose.box_center, np.float64)
+    return np.linalg.norm((center + half).max(-2) - (center - half).min(-2), axis=-1)
 
 
 @jax.jit

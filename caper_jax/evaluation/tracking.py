@@ -15,7 +15,7 @@ from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.schema import Frame
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.metrics import PoseErrors, pose_errors
-from caper_jax.evaluation.report import error_tables, summary
+from caper_jax.evaluation.report import error_tables
 from caper_jax.tracker import Tracker
 
 Start = Literal["truth", "estimator"]
@@ -118,47 +118,17 @@ def track_errors(track: Track, category: Category) -> PoseErrors:
     return pose_errors(track.pose, track.truth, category)
 
 
-def relative_translation(errors: PoseErrors, truth: ArticulatedPose) -> np.ndarray:
-    """[T, K] translation errors over the diagonal of the object's box at rest."""
-    return errors.translation_m / object_diagonal(truth)[:, None]
-
-
-def object_diagonal(pose: ArticulatedPose) -> np.ndarray:
-    """[T] metres, diagonal of the box around all parts at rest."""
-    half = np.asarray(pose.size) / 2
-    low, high = np.asarray(pose.box_center) - half, np.asarray(pose.box_center) + half
-    return np.linalg.norm(high.max(-2) - low.min(-2), axis=-1)
-
-
 def joined_tables(
-    errors: Sequence[PoseErrors], tracks: Sequence[Track], category: Category
+    errors: Sequence[PoseErrors], category: Category
 ) -> dict[str, list[dict[str, Any]]]:
-    """``error_tables`` over all frames of all videos but the first of each.
-
-    Parts also have "translation_relative", see ``relative_translation``.
-
-    Args:
-      errors: of each video.
-      tracks: of the same videos, with ground truth.
-      category: theirs.
-    """
+    """``error_tables`` over all frames of all videos (their errors) but the first of each."""
     joined = PoseErrors(
         **{
             key: np.concatenate([getattr(error, key)[1:] for error in errors])
             for key in PoseErrors.__dataclass_fields__
         }
     )
-    relative = np.concatenate(
-        [
-            relative_translation(error, track.truth)[1:]
-            for error, track in zip(errors, tracks, strict=True)
-            if track.truth is not None
-        ]
-    )
-    tables = error_tables(joined, category)
-    for number, part in enumerate(tables["parts"]):
-        part["translation_relative"] = summary(relative[:, number])
-    return tables
+    return error_tables(joined, category)
 
 
 def summarise_tracks(
@@ -174,7 +144,7 @@ def summarise_tracks(
       part_masks: "predicted" or "given".
     """
     errors = [track_errors(track, category) for track in tracks]
-    tables = joined_tables(errors, tracks, category)
+    tables = joined_tables(errors, category)
     after = {
         key: np.concatenate([getattr(track, key)[1:] for track in tracks])
         for key in ("keyframe", "estimated", "lost", "seconds")

@@ -8,9 +8,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from caper_jax.data.synthetic.scene import Batch
+from caper_jax.data.synthetic.scene import Batch, Generator
 from caper_jax.data.synthetic.videos import VideoGenerator
 from caper_jax.progress import progress
+
+FRAMES_AT_A_TIME = 25  # what the frames of a seed are depends on it
 
 
 def collect(
@@ -34,6 +36,22 @@ def collect(
             parts.append(jax.tree.map(lambda array, n=count: np.asarray(array)[:n], batch))
             bar.update(count)
     return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
+
+
+def collect_frames(
+    generator: Generator, seed: int, frames: int, title: str = "generating"
+) -> dict[str, Any]:
+    """Single frames as the arguments of ``hdf5.write`` that they decide.
+
+    Args:
+      generator: draws them.
+      seed, title: see ``collect``.
+      frames: how many.
+    """
+    batch = collect(generator.batch, seed, frames, FRAMES_AT_A_TIME, title)
+    prefix = f"{generator.category.name}_{generator.split}"
+    names = [f"{prefix}{instance:04d}_{index:06d}" for index, instance in enumerate(batch.instance)]
+    return {**vars(batch), "names": names}
 
 
 def collect_videos(

@@ -21,15 +21,21 @@ COUNTS_HEADER = (
 )
 COUNTS_LABELS = 2
 # What the columns mean, beneath every table that has them.
-COLUMNS = (
+ERROR_COLUMNS = (
     "ratio: ours over the paper's, below 1 is better",
     "trans [%]: distance of part origins over the diagonal of the object's box at rest",
     "IoU size: of the boxes' sizes alone, most likely the paper's 3D IoU; IoU full: exact, of the "
     "oriented boxes in the camera's frame",
+)
+SYMMETRY = (
+    "up to symmetry: against the better of the readings that the category declares equally right, "
+    "frame by frame"
+)
+COLUMNS = (
+    *ERROR_COLUMNS,
     "means over all frames of all videos but the first of each; a lost frame counts with the pose "
     "that was held",
-    "up to symmetry: against the better of the readings that the category declares equally right, "
-    "frame by frame",
+    SYMMETRY,
 )
 
 

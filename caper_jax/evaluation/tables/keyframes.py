@@ -15,7 +15,7 @@ from caper_jax.evaluation.tables import comparison, runs
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.paper import TABLES
 from caper_jax.evaluation.tables.render import Curves, Report, Table, spread
-from caper_jax.evaluation.tracking import Track, relative_translation, track_errors
+from caper_jax.evaluation.tracking import Track, track_errors
 from caper_jax.tracker import Tracker
 from caper_jax.tracking.config import Policy, TrackerConfig
 
@@ -126,13 +126,7 @@ def error_growth(tracks: Sequence[Track], category: Category) -> dict[str, Any]:
     errors = [track_errors(track, category) for track in tracks]
     length = min(len(track.frames) for track in tracks)
     turn = np.stack([error.rotation_deg[1:length] for error in errors])
-    shift = np.stack(
-        [
-            relative_translation(error, track.truth)[1:length]
-            for error, track in zip(errors, tracks, strict=True)
-            if track.truth is not None
-        ]
-    )
+    shift = np.stack([error.translation_relative[1:length] for error in errors])
     frames = np.arange(1, length)
     parts = {}
     for part in (0, category.num_parts - 1):

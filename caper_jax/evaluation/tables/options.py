@@ -16,11 +16,13 @@ class Options:
     Attributes:
       out: folder of the results; generated videos and trained runs are kept there too.
       category: a subset of the reproduction's categories; empty for all.
-      videos, frames: of each category's test set, and of each of its generated videos.
+      videos, frames: of each category's test set, and of each of its generated videos; frames is
+        the size of a test set where that is single frames.
       mode: how generated videos move, see ``data.synthetic.videos.MODES``.
       data, format, split: a data set to measure on instead of generated videos.
       weights: a model directory, or a folder with one per category.
-      seed: of the generated videos.
+      object_scale: see ``estimator.load``.
+      seed: of the generated frames or videos.
       given_masks: add runs with the data's part labels.
       network_alone: track by the network's increment, without registration.
       seeds: runs to train of each kind.
@@ -37,6 +39,7 @@ class Options:
     format: str | None = None
     split: str | None = None
     weights: Path | None = None
+    object_scale: float = 1.0
     seed: int = 0
     given_masks: bool = False
     network_alone: bool = False

@@ -13,14 +13,13 @@ from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load, shipped_weights
-from caper_jax.evaluation.metrics import pose_errors_up_to_symmetry
+from caper_jax.evaluation.metrics import object_diagonal, pose_errors_up_to_symmetry
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.videos import SPLIT, Videos, dataset_videos, generated_videos
 from caper_jax.evaluation.tracking import (
     Start,
     Track,
     joined_tables,
-    object_diagonal,
     summarise_tracks,
     track_video,
 )
@@ -80,13 +79,14 @@ def describe_tracker(options: Options) -> str:
     return "tracker: the network's increments, refined by registration (beyond the paper)"
 
 
-def find_model(category: str, weights: Path | None) -> Estimator | None:
+def find_model(category: str, weights: Path | None, object_scale: float = 1.0) -> Estimator | None:
     """The model of a category; None where there is none, which is no error.
 
     Args:
       category: its name, or FILE.py:NAME.
       weights: a model directory, or a folder with one per category, named like it; None for the
         package's own.
+      object_scale: see ``estimator.load``.
 
     Raises:
       CaperError: unknown category, a damaged model, or a folder without any.
@@ -94,13 +94,14 @@ def find_model(category: str, weights: Path | None) -> Estimator | None:
     category = categories.get(category).name
     if weights is None:
         present = (shipped_weights() / category).is_dir()
-        return load(category) if present else None
+        return load(category, None, object_scale) if present else None
     if (weights / CARD_FILE).is_file():
-        return load(category, weights) if _model_category(weights) == category else None
+        same = _model_category(weights) == category
+        return load(category, weights, object_scale) if same else None
     if not any(weights.glob(f"*/{CARD_FILE}")):
         raise CaperError(f"--weights {weights}: neither a model directory nor a folder of them")
     directory = weights / category
-    return load(category, directory) if directory.is_dir() else None
+    return load(category, directory, object_scale) if directory.is_dir() else None
 
 
 def need_models(names: Sequence[str], weights: Path | None) -> dict[str, Estimator]:
@@ -174,7 +175,7 @@ def find_case(
     Raises:
       CaperError: see ``find_model`` and ``open_videos``.
     """
-    estimator = find_model(name, options.weights)
+    estimator = find_model(name, options.weights, options.object_scale)
     if estimator is None:
         return NO_MODEL
     source = open_videos(options, estimator.category, videos, frames)
@@ -218,6 +219,6 @@ def summarise(tracks: Sequence[Track], videos: Videos, condition: Condition) -> 
         ]
         found["up_to_symmetry"] = {
             "reasons": [equivalence.reason for equivalence in category.equivalences],
-            "parts": joined_tables(errors, tracks, category)["parts"],
+            "parts": joined_tables(errors, category)["parts"],
         }
     return found

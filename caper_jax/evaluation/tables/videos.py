@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from caper_jax._version import __version__
 from caper_jax.articulation.category import Category
 from caper_jax.data import categories_in, hdf5, open_dataset
 from caper_jax.data.schema import Dataset, Frame
+from caper_jax.data.synthetic.bank import Bank
 from caper_jax.data.synthetic.collect import collect_videos
 from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.data.synthetic.videos import MODES, VideoGenerator
@@ -77,15 +78,16 @@ def generated_videos(
         "instances": config.instances,
         "grid": config.grid,
         "mode": mode,
-        "shapes": _fingerprint(generator),
+        "shapes": fingerprint(generator.bank),
     }
     points = config.num_points
     path = folder / f"{category.name}_{mode}_{videos}x{frames}x{points}_seed{seed}.h5"
-    kept = hdf5.Hdf5Dataset(path, category.name, SPLIT) if path.is_file() else None
-    if kept is None or any(kept.attributes.get(key) != value for key, value in wanted.items()):
-        folder.mkdir(parents=True, exist_ok=True)
-        _draw(path, generator, videos, seed, wanted)
-        kept = hdf5.Hdf5Dataset(path, category.name, SPLIT)
+
+    def draw() -> dict[str, Any]:
+        title = f"generating {category.name} videos"
+        return collect_videos(generator, seed, videos, _BATCH, title)
+
+    kept = kept_file(path, category, wanted, draw)
     # A given first pose of a root that never moves stays right by itself: readers must know.
     stands = " (camera and root stand still)" if MODES[mode].camera_speed == 0 else ""
     return Videos(
@@ -123,22 +125,34 @@ def dataset_videos(
     return Videos(category, dataset, index, description)
 
 
-def _draw(path: Path, generator: VideoGenerator, videos: int, seed: int, attributes) -> None:
-    """Draws the videos and writes them to a file."""
-    category = generator.category
-    title = f"generating {category.name} videos"
-    hdf5.write(
-        path,
-        category=category,
-        split=SPLIT,
-        **collect_videos(generator, seed, videos, _BATCH, title),
-        attributes=attributes,
-        overwrite=True,
-    )
+def kept_file(
+    path: Path,
+    category: Category,
+    attributes: dict[str, Any],
+    draw: Callable[[], dict[str, Any]],
+) -> hdf5.Hdf5Dataset:
+    """The test set in a file with these attributes; drawn and written where there is none.
+
+    Args:
+      path: of the file; its folder is made if it does not exist.
+      category: what it shows.
+      attributes: all that decides what the file holds.
+      draw: gives the other arguments of ``hdf5.write``.
+
+    Raises:
+      CaperError: a damaged file.
+    """
+    if path.is_file():
+        kept = hdf5.Hdf5Dataset(path, category.name, SPLIT)
+        if all(kept.attributes.get(key) == value for key, value in attributes.items()):
+            return kept
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = {**draw(), "category": category, "split": SPLIT, "attributes": attributes}
+    hdf5.write(path, **content, overwrite=True)
+    return hdf5.Hdf5Dataset(path, category.name, SPLIT)
 
 
-def _fingerprint(generator: VideoGenerator) -> int:
-    """Changes with the shapes, so that videos of other shapes are not taken for these."""
-    bank = generator.bank
+def fingerprint(bank: Bank) -> int:
+    """Changes with the shapes, so that a test set of other shapes is not taken for theirs."""
     arrays = (bank.size, bank.box_center, bank.limits, bank.joint_pivot)
     return zlib.crc32(b"".join(np.asarray(array).tobytes() for array in arrays))
