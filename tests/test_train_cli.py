@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import types
 from pathlib import Path
 
 import jax
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from caper_jax import cli
+from caper_jax import categories, cli
 from caper_jax.configuration import update
 from caper_jax.errors import CaperError
 from caper_jax.model_files import read_model
@@ -125,6 +126,10 @@ def test_a_model_can_start_another_run(model, tmp_path):
     assert cli.main([*arguments, "--out", str(folder)]) == 0
     card, variables = read_model(folder)
     assert card["started_from"]["steps"] == 10 and card["steps"] == 10
+    assert "run" not in card["started_from"]
+    assert (
+        card["samples_in_all"] == 2 * card["samples"] == 20 * card["run"]["training"]["batch_size"]
+    )
     # Ten small steps from there, not from anywhere.
     moved = [
         np.abs(leaf - start).max()
@@ -137,7 +142,27 @@ def test_a_model_can_start_another_run(model, tmp_path):
     assert 0 < max(moved) < 0.1
 
 
-def test_a_model_of_another_category_gives_what_fits():
+def test_all_categories_one_after_the_other(tmp_path, monkeypatch, capsys):
+    (tmp_path / "models" / "drawer").mkdir(parents=True)
+    called = []
+
+    def train(config, directory, initial):
+        called.append((config.category, config.training.minutes, directory, initial))
+        finished = config.category != "laptop"
+        return types.SimpleNamespace(finished=finished, state=types.SimpleNamespace(step=7))
+
+    monkeypatch.setattr(run, "train", train)
+    arguments = ["train", "--category", "all", "--from", str(tmp_path / "models")]
+    assert cli.main([*arguments, "--minutes", "2", "--out", str(tmp_path)]) == 130
+    names = categories.names()
+    assert [call[0] for call in called] == list(names[: names.index("laptop") + 1])
+    for name, minutes, directory, initial in called:
+        own = tmp_path / "models" / "drawer" if name == "drawer" else tmp_path / "models"
+        assert (minutes, directory, initial) == (2, tmp_path / name, own)
+    assert "stopped at step 7" in capsys.readouterr().out
+
+
+def test_a_model_of_another_category_gives_its_encoders():
     def variables(outputs, width, fill):
         sizes = {"encoder": (3, width), "state": (width, 4), "size": (4, outputs)}
         layers = {name: np.full(shape, fill, np.float32) for name, shape in sizes.items()}
@@ -147,7 +172,7 @@ def test_a_model_of_another_category_gives_what_fits():
     start = run.initial_variables(begin, stored, "there", same_category=False)
     parts = start["params"]["parts"]
     np.testing.assert_array_equal(parts["encoder"]["kernel"], 1.0)
-    np.testing.assert_array_equal(parts["state"]["kernel"], 1.0)
+    np.testing.assert_array_equal(parts["state"]["kernel"], np.zeros((5, 4)))
     np.testing.assert_array_equal(parts["size"]["kernel"], np.zeros((4, 6)))
     for other, same in ((variables(6, 7, 1.0), False), (stored, True)):
         with pytest.raises(CaperError, match="there: its weights are of another network"):

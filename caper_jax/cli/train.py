@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from caper_jax.training.run import RunConfig
 
 
+ALL = "all"
+
+
 def build_parser() -> argparse.ArgumentParser:
     parser = common.create_parser(
         "train",
@@ -29,10 +32,13 @@ def build_parser() -> argparse.ArgumentParser:
             ("--category laptop --preset paper --steps 1000 --out runs/paper", ""),
             ("--category box --data ROOT --format artimage --out runs/own", "your own data"),
             ("--category box --set training.learning_rate=1e-3 --steps 500 --out runs/try", ""),
+            ("--category all --from runs/box --minutes 60 --out runs", "each into runs/<category>"),
         ],
     )
     parser.add_argument(
-        "--category", required=True, help="e.g. box, or FILE.py:NAME for one of your own"
+        "--category",
+        required=True,
+        help="e.g. box, or FILE.py:NAME for one of your own, or all, one after the other",
     )
     parser.add_argument("--preset", default="fast", help="fast or paper (default: fast)")
     parser.add_argument("--config", type=Path, help="TOML file of settings over the preset's")
@@ -50,7 +56,7 @@ def build_parser() -> argparse.ArgumentParser:
         dest="initial",
         metavar="DIR",
         help="start from the weights of this model instead of random ones; one of another "
-        "category gives its encoders and what fits of its heads",
+        "category gives its encoders; a folder of models gives each category its own",
     )
     parser.add_argument(
         "--data",
@@ -77,10 +83,40 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
     common.check_folder(arguments.out, "--out")
+    from caper_jax import categories
+
+    if arguments.category != ALL:
+        return _train(arguments.category, arguments, arguments.out, arguments.initial)
+    for name in categories.names():
+        print(f"{name}:", flush=True)
+        initial = arguments.initial
+        if initial is not None and (initial / name).is_dir():
+            initial /= name
+        code = _train(name, arguments, arguments.out / name, initial)
+        if code:
+            return code
+    return 0
+
+
+def _train(category: str, arguments: argparse.Namespace, out: Path, initial: Path | None) -> int:
+    """Trains one category; returns the exit code."""
+    from caper_jax.training import run
+
+    result = run.train(_configuration(category, arguments), out, initial)
+    steps = int(result.state.step)
+    if not result.finished:
+        print(f"stopped at step {steps}; the same command goes on from there")
+        return common.EXIT_INTERRUPTED
+    print(f"trained {steps} steps; model written to {out}")
+    return 0
+
+
+def _configuration(category: str, arguments: argparse.Namespace) -> RunConfig:
+    """The run that the arguments describe."""
     from caper_jax.configuration import override, update
     from caper_jax.training import run
 
-    config = run.preset(arguments.preset, arguments.category)
+    config = run.preset(arguments.preset, category)
     if arguments.config is not None:
         config = update(config, arguments.config)
     config = _with_dataset(config, arguments)
@@ -93,13 +129,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.seed is not None:
         training = dataclasses.replace(config.training, seed=arguments.seed)
         config = dataclasses.replace(config, training=training)
-    result = run.train(config, arguments.out, arguments.initial)
-    steps = int(result.state.step)
-    if not result.finished:
-        print(f"stopped at step {steps}; the same command goes on from there")
-        return common.EXIT_INTERRUPTED
-    print(f"trained {steps} steps; model written to {arguments.out}")
-    return 0
+    return config
 
 
 def _with_dataset(config: RunConfig, arguments: argparse.Namespace) -> RunConfig:

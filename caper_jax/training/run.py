@@ -112,8 +112,7 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
       directory: gets config.json, metrics.jsonl, checkpoints/ and, once the budget is used up,
         weights.npz and model.json.
       initial: model directory whose weights the run starts from (its card is kept in the new
-        one); by default the weights are random. A model of another category gives its encoders
-        and what fits of its heads.
+        one); by default the weights are random. A model of another category gives its encoders.
 
     Raises:
       CaperError: see ``training.loop.fit``.
@@ -140,7 +139,7 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
     if result.finished and jax.process_index() == 0:
         card = _card(config, result, draw_sample())
         if started_from is not None:
-            card["started_from"] = started_from
+            card |= _with_origin(card, started_from)
         write_model(directory, jax.device_get(result.state.variables), card)
     return result
 
@@ -202,26 +201,18 @@ def initial_variables(
 ) -> Any:
     """Stored weights in the place of random ones; CaperError where they do not fit.
 
-    From a model of another category the encoders are taken, and every layer of the heads that has
-    the shape of this category's; the other layers keep their random weights.
+    A model of another category gives its encoders only: outputs of its heads would begin with that
+    category's conventions, and from an axis that points the other way no gradient leads back.
     """
     wanted, found = flatten(template), flatten(stored)
-    fits = {
-        name
-        for name, leaf in wanted.items()
-        if name in found and np.shape(found[name]) == np.shape(leaf)
-    }
-    needed = [name for name in wanted if same_category or "/encoder/" in name]
-    if not fits.issuperset(needed) or (same_category and found.keys() != wanted.keys()):
+    taken = [name for name in wanted if same_category or "/encoder/" in name]
+    fits = all(name in found and np.shape(found[name]) == np.shape(wanted[name]) for name in taken)
+    if not fits or (same_category and found.keys() != wanted.keys()):
         raise CaperError(
             f"{directory}: its weights are of another network than this run's; use the same "
             "preset and network settings"
         )
-    start = {
-        name: jnp.asarray(found[name] if name in fits else leaf, jnp.float32)
-        for name, leaf in wanted.items()
-    }
-    return unflatten(start)
+    return unflatten(wanted | {name: jnp.asarray(found[name], jnp.float32) for name in taken})
 
 
 def mean_pose(batch: Batch | LabelledClouds) -> dict[str, Any]:
@@ -261,6 +252,16 @@ def _card(config: RunConfig, result: FitResult, sample: Batch | LabelledClouds) 
         "hardware": _hardware(),
         "mean_pose": mean_pose(sample),
     }
+
+
+def _with_origin(card: dict[str, Any], origin: dict[str, Any]) -> dict[str, Any]:
+    """What the card of a model says about the one it started from, and of both together."""
+    kept = ("category", "version", "commit", "steps", "samples", "training_seconds", "hardware")
+    totals = {
+        f"{key}_in_all": card[key] + origin.get(f"{key}_in_all", origin.get(key, 0))
+        for key in ("samples", "training_seconds")
+    }
+    return {"started_from": {key: origin[key] for key in kept if key in origin}, **totals}
 
 
 def _hardware() -> str:
