@@ -39,15 +39,28 @@ def write_model(directory: str | Path, variables: PyTree, card: dict[str, Any]) 
     """
     directory = Path(directory)
     arrays = {name: _compact(name, leaf) for name, leaf in flatten(variables).items()}
-    try:
-        text = json.dumps(card, indent=2, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise CaperError(f"the model card cannot be written as JSON: {error}") from error
+    text = _card_text(card)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     directory.mkdir(parents=True, exist_ok=True)
     write_atomically(directory / WEIGHTS_FILE, buffer.getvalue())
-    write_atomically(directory / CARD_FILE, text.encode() + b"\n")
+    write_atomically(directory / CARD_FILE, text)
+
+
+def write_card(directory: str | Path, card: dict[str, Any]) -> None:
+    """Replaces the card of a model; its weights stay.
+
+    Raises:
+      CaperError: the card is not JSON.
+    """
+    write_atomically(Path(directory) / CARD_FILE, _card_text(card))
+
+
+def _card_text(card: dict[str, Any]) -> bytes:
+    try:
+        return json.dumps(card, indent=2, allow_nan=False).encode() + b"\n"
+    except (TypeError, ValueError) as error:
+        raise CaperError(f"the model card cannot be written as JSON: {error}") from error
 
 
 def read_model(directory: str | Path) -> tuple[dict[str, Any], PyTree]:

@@ -22,6 +22,11 @@ def prediction(points, pose):
         labels=np.arange(points.shape[1], dtype=np.int32)[None] % 2,
         confidence=np.array([[0.75, 0.5]], np.float32),
         degenerate=np.array([False]),
+        seen=np.array([[points.shape[1] - 3, 3]], np.int32),
+        evidence=np.zeros((1, 2, 6), np.float32),
+        rotation_std=np.radians(np.array([[1.25, 2.5]], np.float32)),
+        translation_std=np.array([[0.004, 0.006]], np.float32),
+        state_std=np.radians(np.array([[3.0]], np.float32)),
     )
 
 
@@ -72,7 +77,12 @@ def test_pose_is_printed_and_written(files, seen, capsys):
     assert result["category"] == "box" and result["parts"] == ["base", "lid"]
     assert result["units"] == {"length": "metres", "joint_state": ["degrees"]}
     assert "OpenCV" in result["frame"]
-    assert result["points"] == {"available": 1999, "dropped": 1}
+    assert result["points"] == {"available": 1999, "dropped": 1, "of_parts": [1021, 3]}
+    assert result["hidden"] == [False, True]
+    deviation = result["standard_deviation"]
+    np.testing.assert_allclose(deviation["rotation_deg"], [1.25, 2.5], rtol=1e-6)
+    np.testing.assert_allclose(deviation["translation"], [0.004, 0.006], rtol=1e-6)
+    np.testing.assert_allclose(deviation["joint_state"], [3.0], rtol=1e-6)
     assert result["confidence"] == [0.75, 0.5]
     assert list(result["pose"]) == list(vars(pose))
     for key, expected in vars(pose).items():
@@ -82,6 +92,8 @@ def test_pose_is_printed_and_written(files, seen, capsys):
     assert f"{np.degrees(pose.joint_state[0]):.1f}°" in table
     assert " ".join(f"{value:.3f}" for value in pose.translation[1]) in table
     assert "1999 points, 1 dropped" in table
+    assert "lid: standard deviation 2.5 deg, 6 mm" in table
+    assert "lid: hidden (3 points), known through its joint alone" in table
     assert max(map(len, table.splitlines())) <= 80
 
 

@@ -16,6 +16,7 @@ COMMANDS = {
     "estimate": "estimate poses from your own depth image or point cloud",
     "generate": "write synthetic labelled data",
     "train": "train a category's networks, or resume a run",
+    "calibrate": "calibrate what a model says about its own errors",
     "track": "track an object through videos or a live stream",
     "evaluate": "measure a model on labelled data",
     "validate": "check labelled data and list what is wrong with it",

@@ -106,12 +106,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"confidence {' '.join(f'{value:.2f}' for value in confidence)}; {cloud.available} points, "
         f"{cloud.dropped} dropped"
     )
+    print(_deviations(prediction, category), end="")
     if prediction.degenerate:
         print("the rotation is arbitrary: the two directions that give it are parallel")
     if arguments.json is not None:
         from caper_jax.files import write_atomically
 
-        text = json.dumps(_as_json(pose, category, cloud, confidence), indent=2, allow_nan=False)
+        content = _as_json(prediction, category, cloud)
+        text = json.dumps(content, indent=2, allow_nan=False)
         write_atomically(arguments.json, text.encode() + b"\n")
     if arguments.picture is not None:
         from caper_jax.visualization.picture import write_picture
@@ -178,23 +180,53 @@ def _state(pose: ArticulatedPose, category: Category, joint: int) -> tuple[float
     return value, "metres"
 
 
-def _as_json(
-    pose: ArticulatedPose, category: Category, cloud: Cloud, confidence: np.ndarray
-) -> dict[str, Any]:
+def _deviations(prediction: Prediction, category: Category) -> str:
+    """Lines on how sure the model is, and on parts that are known through their joints alone."""
+    from caper_jax.confidence import HIDDEN_POINTS
+
+    lines = []
+    if prediction.rotation_std is not None:
+        for k, name in enumerate(category.parts):
+            turn = np.degrees(prediction.rotation_std[k])
+            shift = 1000 * prediction.translation_std[k]
+            lines.append(f"{name}: standard deviation {turn:.1f} deg, {shift:.0f} mm")
+    for name, count in zip(category.parts, prediction.seen, strict=True):
+        if count < HIDDEN_POINTS:
+            lines.append(f"{name}: hidden ({count} points), known through its joint alone")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _as_json(prediction: Prediction, category: Category, cloud: Cloud) -> dict[str, Any]:
     """The pose under the names of ``ArticulatedPose``; joint states in degrees or metres."""
+    from caper_jax.confidence import HIDDEN_POINTS
+
+    pose = prediction.pose
     states = [_state(pose, category, j) for j in range(category.num_joints)]
     values = {key: np.asarray(value, float).tolist() for key, value in vars(pose).items()}
     values["joint_state"] = [value for value, _ in states]
-    return {
+    content = {
         "category": category.name,
         "parts": list(category.parts),
         "joint_types": list(category.joint_types),
         "frame": FRAME,
         "units": {"length": "metres", "joint_state": [unit for _, unit in states]},
         "pose": values,
-        "confidence": confidence.tolist(),
-        "points": {"available": cloud.available, "dropped": cloud.dropped},
+        "confidence": prediction.confidence.tolist(),
+        "points": {
+            "available": cloud.available,
+            "dropped": cloud.dropped,
+            "of_parts": prediction.seen.tolist(),
+        },
+        "hidden": [bool(count < HIDDEN_POINTS) for count in prediction.seen],
     }
+    if prediction.rotation_std is not None:
+        factors = [np.degrees(1.0) if unit == "degrees" else 1.0 for _, unit in states]
+        content["standard_deviation"] = {
+            "rotation_deg": np.degrees(prediction.rotation_std).tolist(),
+            "translation": prediction.translation_std.tolist(),
+            "joint_state": (prediction.state_std * factors).tolist(),
+        }
+    return content
 
 
 def _scene(

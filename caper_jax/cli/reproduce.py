@@ -65,6 +65,9 @@ REPRODUCTIONS = {
     "table10": Reproduction(
         "keyframes", "keyframes none, fixed or dynamic; error against frame", _TRACKING
     ),
+    "reliability": Reproduction(
+        "reliability", "how often the truth lies where the model says", _STATIC
+    ),
     "jitter": Reproduction("jitter", "trembling on an object that stands still", _MOVING),
     "modes": Reproduction("modes", "errors by how camera and joints move", _MOVING),
 }

@@ -22,10 +22,12 @@ from caper_jax.data import open_dataset
 from caper_jax.data.loader import LabelledClouds, Loader, LoaderConfig
 from caper_jax.data.synthetic.scene import Batch, Generator, GeneratorConfig
 from caper_jax.errors import CaperError, unknown_name
-from caper_jax.model_files import flatten, read_model, unflatten, write_model
+from caper_jax.estimator import Estimator
+from caper_jax.model_files import flatten, read_model, unflatten, write_card, write_model
 from caper_jax.networks.caper import NetworkConfig
 from caper_jax.networks.presets import PRESETS as NETWORKS
 from caper_jax.training import parallel
+from caper_jax.training.calibration import FRAMES, calibrate
 from caper_jax.training.loop import FitResult, TrainingConfig, fit
 from caper_jax.training.losses import LossWeights
 from caper_jax.training.task import LossConfig, Task
@@ -60,6 +62,8 @@ class RunConfig:
       loader: a dataset to train on instead of generated frames.
       loss: weights and targets.
       training: optimiser and budget.
+      calibration_frames: generated frames to calibrate the trained model on, see
+        ``training.calibration``; 0 for none. Models trained on a dataset are not calibrated.
     """
 
     category: str
@@ -68,6 +72,7 @@ class RunConfig:
     loader: LoaderConfig | None = None
     loss: LossConfig = LossConfig()
     training: TrainingConfig = TrainingConfig(minutes=60.0)
+    calibration_frames: int = FRAMES
 
     def __post_init__(self) -> None:
         if self.data.num_points != self.network.num_points:
@@ -140,7 +145,14 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         card = _card(config, result, draw_sample())
         if started_from is not None:
             card |= _with_origin(card, started_from)
-        write_model(directory, jax.device_get(result.state.variables), card)
+        variables = jax.device_get(result.state.variables)
+        write_model(directory, variables, card)
+        if config.loader is None and config.calibration_frames:
+            # Of the weights as they are stored, and once they are: it can be made up for.
+            card, variables = read_model(directory)
+            estimator = Estimator(category, config.network, variables, card)
+            arguments = (config.data, config.calibration_frames, config.training.seed)
+            write_card(directory, {**card, "calibration": calibrate(estimator, *arguments)})
     return result
 
 

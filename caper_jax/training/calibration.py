@@ -1,0 +1,108 @@
+"""Calibrates what a model says about its own errors (``caper_jax.confidence``)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from caper_jax.confidence import COVERAGE
+from caper_jax.data.synthetic.config import GeneratorConfig
+from caper_jax.data.synthetic.scene import Batch, Generator
+from caper_jax.errors import CaperError
+from caper_jax.estimator import Estimator, estimate
+from caper_jax.geometry import so3
+from caper_jax.progress import progress
+
+FRAMES = 2048
+SPLIT = "val"
+_BATCH = 32
+_SMALLEST = 1e-5  # radians or units: below it an error has no logarithm worth fitting
+_ITERATIONS = 200
+
+
+def calibrate(
+    estimator: Estimator, config: GeneratorConfig, frames: int = FRAMES, seed: int = 0
+) -> dict[str, Any]:
+    """The "calibration" section of a model card, JSON-ready.
+
+    Args:
+      estimator: the model.
+      config: what half of the frames look like; the others have the sensors' noise alone. Of
+        instances that training never saw.
+      frames: how many to fit on.
+      seed: of shapes and frames.
+
+    Raises:
+      CaperError: too few frames.
+    """
+    if frames < 10 * _BATCH:
+        raise CaperError(f"calibration needs {10 * _BATCH} frames or more, got {frames}")
+    rough = replace(
+        config, instances=min(config.instances, frames), num_points=estimator.network.num_points
+    )
+    clean = GeneratorConfig(
+        instances=rough.instances, grid=rough.grid, num_points=rough.num_points, noise=rough.noise
+    )
+    generators = [Generator(estimator.category, one, SPLIT, seed) for one in (rough, clean)]
+    key = jax.random.key(seed)
+    measure = jax.jit(partial(_measure, estimator=estimator))
+    rows = []
+    with progress("calibrating", total=frames) as bar:
+        for start in range(0, frames, _BATCH):
+            generator = generators[start // _BATCH % 2]
+            batch = generator.batch(jax.random.fold_in(key, start), _BATCH)
+            rows.append(jax.tree.map(np.asarray, measure(estimator.variables, batch)))
+            bar.update(min(_BATCH, frames - start))
+    found, *errors = (np.concatenate(column)[:frames] for column in zip(*rows, strict=True))
+    low, high = np.quantile(found, [0.01, 0.99], axis=(0, 1))
+    inside = np.clip(found, low, high)
+    rotation, translation, state = (
+        [
+            quantile_regression(inside[:, -count + k], np.log(np.maximum(error[:, k], _SMALLEST)))
+            for k in range(count)
+        ]
+        for error, count in zip(errors, (error.shape[1] for error in errors), strict=True)
+    )
+    section = {"rotation": rotation, "translation": translation, "state": state}
+    section |= {"low": low, "high": high}
+    rounded = {name: np.round(np.asarray(value), 5).tolist() for name, value in section.items()}
+    return {**rounded, "coverage": COVERAGE, "frames": frames, "split": SPLIT, "seed": seed}
+
+
+def quantile_regression(inputs: np.ndarray, target: np.ndarray, level: float = COVERAGE):
+    """Coefficients [F + 1], the constant last, of the linear ``level`` quantile.
+
+    Minimises the pinball loss by majorisation: each step replaces |r| by a parabola that touches
+    it where the residual r is, and solves the weighted least squares that follow.
+
+    Args:
+      inputs: [S, F].
+      target: [S].
+      level: share of the targets that lie below.
+    """
+    design = np.column_stack([inputs, np.ones(len(target))]).astype(np.float64)
+    # A hair of ridge: evidence that never varies leaves its coefficient at zero.
+    ridge = 1e-6 * len(target) * np.eye(design.shape[1])
+    found = np.linalg.solve(design.T @ design + ridge, design.T @ target)
+    for _ in range(_ITERATIONS):
+        weight = 1.0 / (np.abs(target - design @ found) + 1e-4)
+        weighted = design * weight[:, None]
+        right = weighted.T @ target + (2.0 * level - 1.0) * design.sum(0)
+        found = np.linalg.solve(weighted.T @ design + ridge, right)
+    return found
+
+
+def _measure(variables, batch: Batch, estimator: Estimator):
+    """(evidence [B, K, E], errors of rotation [B, K], translation [B, K], state [B, J])."""
+    category = estimator.category
+    prediction = estimate(variables, batch.points, category, estimator.network)
+    pose, truth = prediction.pose, batch.pose
+    shift = (pose.translation - truth.translation) * category.unit
+    state = jnp.abs(pose.joint_state - truth.joint_state) * category.state_units
+    turn = so3.geodesic_distance(pose.rotation, truth.rotation)
+    return prediction.evidence, turn, jnp.linalg.norm(shift, axis=-1), state
