@@ -256,6 +256,7 @@ def laptop_fix(root, state=0.0) -> Fix:
         parts=np.float32(np.stack([np.eye(4), lid])),
         labels=POINT_LABELS,
         constants=constants,
+        sure=np.float32(1),
     )
 
 
@@ -308,18 +309,19 @@ class TestCorrected:
 
     @pytest.fixture
     def run(self, programs):
-        def run(estimate=self.ESTIMATE, fits="track", variance=0.0, **flags):
+        def run(estimate=self.ESTIMATE, fits="track", variance=0.0, sure=0.9, **flags):
             """(turn, shift and joint state found, variance, asked, replaced)."""
-            lost, doubted, due = (flags.pop(name, False) for name in ("lost", "doubted", "due"))
+            lost, due = (flags.pop(name, False) for name in ("lost", "due"))
+            doubtful = np.int32(flags.pop("doubtful", 3 * flags.pop("doubted", False)))
             turn, shift, state = estimate
             tracked = laptop_fix(ROOT, 0.5)
             static = laptop_fix(ROOT @ rigid([0, turn, 0], [0, shift, 0]), state)
             key = tuple(flags.items())
             if key not in programs:
 
-                def corrected(static, points, tracked, state, due, doubted):
+                def corrected(static, points, tracked, state, due, doubtful):
                     state, settings = SimpleNamespace(**state), TrackerConfig(**flags)
-                    rest = due, doubted, LAPTOP, None, settings
+                    rest = due, doubtful, LAPTOP, None, settings
                     return keyframes.corrected(
                         static, points, None, tracked, misfit(tracked, points), state, *rest
                     )
@@ -327,7 +329,9 @@ class TestCorrected:
                 programs[key] = quick_jit(corrected)
             points = in_camera(INSIDE, tracked if fits == "track" else static)
             state = {"variance": np.float32(variance) * np.ones(3, np.float32), "lost": lost}
-            fix, *found = programs[key](static, points, tracked, state, due, doubted)
+            static = replace(static, sure=np.float32(sure))
+            fix, *found = programs[key](static, points, tracked, state, due, doubtful)
+            assert found.pop(2) == (bool(found[1]) and (sure >= 0.5 or doubtful >= 5))
             along = np.linalg.inv(tracked.root) @ np.asarray(fix.root, float)
             turned = Rotation.from_matrix(along[:3, :3]).as_rotvec()[1]
             lid = Rotation.from_matrix(fix.parts[1, :3, :3]).as_rotvec()
@@ -380,6 +384,20 @@ class TestCorrected:
         found, variance, asked, replaced = run(estimate, variance=0.1, **flags)
         np.testing.assert_allclose(found, estimate, atol=1e-5)
         np.testing.assert_allclose(variance, self.STATIC, rtol=1e-5)
+        assert asked and replaced
+
+    def test_an_estimate_that_is_not_sure_changes_nothing_but_a_lost_track(self, run):
+        for flags in ({"due": True}, {"doubted": True, "fits": "estimate"}):
+            found, _, asked, replaced = run(variance=0.1, sure=0.4, **flags)
+            np.testing.assert_allclose(found, self.TRACK, atol=1e-6)
+            assert asked and not replaced
+        found, *_, replaced = run(sure=0.4, doubtful=4, fits="estimate")
+        assert not replaced
+        found, *_, replaced = run(sure=0.4, doubtful=5, fits="estimate")
+        np.testing.assert_allclose(found, self.ESTIMATE, atol=1e-5)
+        assert replaced
+        found, _, asked, replaced = run(sure=0.4, lost=True)
+        np.testing.assert_allclose(found, self.ESTIMATE, atol=1e-5)
         assert asked and replaced
 
     def test_a_tracked_pose_is_promoted_unasked(self, run):

@@ -39,6 +39,8 @@ class TrackerConfig:
         network contradicts the track, not only differs from it.
       patience: frames in a row that contradict the track before the static estimator may replace
         it; it does so where it fits its own boxes clearly better.
+      sure: least confidence in both of the root's directions (Eq 18) at which a static estimate may
+        correct or replace a track: from a closed drawer's back any side may be the front.
       misfit: mean distance of the points from their parts' boxes, relative to the object's
         diagonal, above which a frame contradicts the track.
       mismatch: share of unmatched points above which a frame contradicts the track.
@@ -59,6 +61,7 @@ class TrackerConfig:
     gate_deg: float = 15.0
     gate: float = 0.4
     patience: int = 3
+    sure: float = 0.5
     misfit: float = 0.03
     mismatch: float = 0.5
     static_rotation: float = 0.1

@@ -31,6 +31,7 @@ class Fix:
       parts: [K, 4, 4] part poses in the root's frame.
       labels: [N] int32 part of every point.
       constants: joint parameters and sizes.
+      sure: [] in [0, 1], the lesser confidence of the root's two directions (Eq 18); 1 of a track.
     """
 
     root: Any
@@ -38,6 +39,7 @@ class Fix:
     parts: Any
     labels: Any
     constants: Constants
+    sure: Any
 
 
 def measure(
@@ -75,6 +77,7 @@ def measure(
         parts=part_poses(tree, output.state[0]),
         labels=jnp.where(labels >= 0, labels, predicted),
         constants=constants,
+        sure=jnp.asarray(1.0, points.dtype),
     )
 
 
@@ -97,6 +100,7 @@ def estimate_fix(variables, points, labels, category: Category, network: Network
             seen=jnp.asarray(1.0),
             known=jnp.zeros(category.num_joints),
         ),
+        sure=prediction.confidence[0].min(),
     )
 
 

@@ -16,6 +16,7 @@ from caper_jax.tracking.registration import (
 )
 from caper_jax.tracking.state import Keyframe, TrackerState
 
+_LONG = 2  # frames beyond the patience after which an estimate that is not sure counts as well
 _BETTER = 0.6  # misfit of an estimate over the track's, at which it may replace the track
 
 
@@ -50,7 +51,7 @@ def corrected(
     outside,
     state: TrackerState,
     due,
-    doubted,
+    doubtful,
     category,
     network,
     config: TrackerConfig,
@@ -67,12 +68,15 @@ def corrected(
       outside: [] the track's ``misfit`` in this frame.
       state: before this frame.
       due: [] bool, the policy wants a keyframe.
-      doubted: [] bool, the last frames contradicted the track.
+      doubtful: [] int32, so many frames in a row, this one included, contradicted the track; from
+        ``patience`` on it is doubted.
       config: static.
 
     Returns:
-      (fix, variance [3], whether the estimator was asked, whether it replaced the track).
+      (fix, variance [3], whether the estimator was asked, whether its answer counts, as it was sure
+      or the track long doubted, whether that replaced the track).
     """
+    doubted = doubtful >= config.patience
     asked = state.lost | doubted
     if config.policy in ("fixed", "dynamic"):
         asked |= due
@@ -81,8 +85,9 @@ def corrected(
         lambda: estimate_fix(variables, points, labels, category, network),
         lambda: tracked,
     )
+    sure = asked & ((static.sure >= config.sure) | (doubtful >= config.patience + _LONG))
     better = misfit(static, points) < _BETTER * outside
-    replaced = state.lost | (doubted & better)
+    replaced = state.lost | (doubted & sure & better)
 
     static_variance = jnp.square(
         jnp.array([config.static_rotation, config.static_translation, config.static_joint])
@@ -92,7 +97,7 @@ def corrected(
     if config.filtered:
         # One that contradicts the track is not averaged in: a mean of two poses is neither.
         apart = contradicts(tracked.root, static.root, config)
-        gain = jnp.where(apart, 0.0, grown / (grown + static_variance))
+        gain = jnp.where(apart | ~sure, 0.0, grown / (grown + static_variance))
     else:
         gain = jnp.ones(3)
     gain = jnp.where(asked, gain, 0.0)
@@ -105,12 +110,13 @@ def corrected(
         parts=se3.interpolate(tracked.parts, static.parts, gain[2]),
         labels=tracked.labels,
         constants=tracked.constants,
+        sure=tracked.sure,
     )
     fix = select(replaced, static, fused)
     # (1 - gain) grown, which would cancel where the gain is nearly one.
     left = jnp.where(gain > 0, gain * static_variance, grown)
     variance = jnp.where(replaced, static_variance, left)
-    return fix, variance, asked, replaced
+    return fix, variance, asked, sure, replaced
 
 
 def make_keyframe(fix: Fix, points) -> Keyframe:

@@ -188,7 +188,7 @@ def track_step(
         expected = _expectations(config.registration, predicted, (root, joints))
         root, joints, information = register(*against, start, expected, config.registration)
         root = hold_still(state.root, root, information, config.registration.hold)
-    tracked = Fix(root, joints, parts.at(joints), found.labels, constants)
+    tracked = Fix(root, joints, parts.at(joints), found.labels, constants, found.sure)
 
     unmatched = mismatch(*against, (root, joints), config.registration)
     outside = misfit(tracked, points)
@@ -198,7 +198,6 @@ def track_step(
         | contradicts(root, found.root, config)
     )
     doubtful = jnp.where(contradicted, state.doubtful + 1, 0)
-    doubted = doubtful >= config.patience
     energy = chamfer_energy(
         se3.act(se3.inverse(root), points)[::_ENERGY_STRIDE],
         found.labels[::_ENERGY_STRIDE],
@@ -208,7 +207,7 @@ def track_step(
         diagonal(constants),
     )
     due = is_due(energy, unmatched, key.age, config)
-    fix, variance, asked, replaced = corrected(
+    fix, variance, asked, sure, replaced = corrected(
         variables,
         points,
         frame.labels,
@@ -216,12 +215,15 @@ def track_step(
         outside,
         state,
         due,
-        doubted,
+        doubtful,
         category,
         network,
         config,
     )
     due |= replaced
+    settled = (
+        doubtful >= config.patience
+    ) & sure  # one that is unsure is asked again in the next frame
     # Without keyframes a frame knows of the last one only.
     anew = replaced | (config.policy == "none")
     surface = jax.lax.cond(
@@ -247,10 +249,10 @@ def track_step(
         keyframe=select(due, make_keyframe(fix, points), replace(key, age=key.age + 1)),
         surface=surface,
         accepted=jnp.where(
-            replaced, 0.0, jnp.where(doubted, jnp.maximum(outside, state.accepted), state.accepted)
+            replaced, 0.0, jnp.where(settled, jnp.maximum(outside, state.accepted), state.accepted)
         ),
         # A pose from the static estimator alone is on trial: one contradiction undoes it.
-        doubtful=jnp.where(replaced, config.patience - 1, jnp.where(doubted, 0, doubtful)),
+        doubtful=jnp.where(replaced, config.patience - 1, jnp.where(settled, 0, doubtful)),
         lost=jnp.asarray(False),
     )
     held = replace(
