@@ -12,9 +12,8 @@ from caper_jax.data import categories_in, open_dataset
 from caper_jax.data.schema import Dataset
 from caper_jax.data.synthetic.collect import collect_frames
 from caper_jax.data.synthetic.scene import Generator
-from caper_jax.errors import CaperError
-from caper_jax.evaluation.tables.options import Options
-from caper_jax.evaluation.tables.videos import SPLIT, TEST_DATA, fingerprint, kept_file
+from caper_jax.evaluation.tables.options import SPLIT, Options
+from caper_jax.evaluation.tables.videos import TEST_DATA, fingerprint, kept_file
 
 # As ``caper generate`` draws them: the evaluation picks from more points than the networks see.
 FRAME_DATA = replace(TEST_DATA, num_points=4096, measure_visibility=True)
@@ -31,20 +30,16 @@ def open_frames(options: Options, category: Category, frames: int) -> tuple[Data
     Raises:
       CaperError: options that contradict each other; see ``generated_frames``, ``open_dataset``.
     """
-    if options.data is None:
-        for name in ("format", "split"):
-            if getattr(options, name) is not None:
-                raise CaperError(f"--{name} goes with --data")
+    source = options.dataset()
+    if source is None:
         folder, count = options.out / "frames", options.frames or frames
         return generated_frames(folder, category, count, options.seed)
-    if options.format is None:
-        raise CaperError("--data needs --format, the layout of the data")
-    if category.name not in categories_in(options.format, options.data):
+    format, root, split = source
+    if category.name not in categories_in(format, root):
         return None
-    split = options.split or SPLIT
-    dataset = open_dataset(options.format, options.data, category.name, split)
+    dataset = open_dataset(format, root, category.name, split)
     count = min(len(dataset), options.frames or len(dataset))
-    return dataset, f"{count} frames of {options.data} ({options.format}, split {split})"
+    return dataset, f"{count} frames of {root} ({format}, split {split})"
 
 
 def generated_frames(

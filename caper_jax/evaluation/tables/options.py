@@ -6,7 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from caper_jax.errors import unknown_name
+from caper_jax.errors import CaperError, unknown_name
+
+SPLIT = "test"
 
 
 @dataclass(frozen=True)
@@ -59,3 +61,18 @@ class Options:
             if name not in known:
                 raise unknown_name("category of this table", name, known)
         return [name for name in known if name in self.category or not self.category]
+
+    def dataset(self) -> tuple[str, Path, str] | None:
+        """(format, root, split) of the data set to measure on; None for generated data.
+
+        Raises:
+          CaperError: a format or split without data, or data without a format.
+        """
+        if self.data is None:
+            for name in ("format", "split"):
+                if getattr(self, name) is not None:
+                    raise CaperError(f"--{name} goes with --data")
+            return None
+        if self.format is None:
+            raise CaperError("--data needs --format, the layout of the data")
+        return self.format, self.data, self.split or SPLIT

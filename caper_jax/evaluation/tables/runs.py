@@ -15,7 +15,7 @@ from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load, shipped_weights
 from caper_jax.evaluation.metrics import object_diagonal, pose_errors_up_to_symmetry
 from caper_jax.evaluation.tables.options import Options
-from caper_jax.evaluation.tables.videos import SPLIT, Videos, dataset_videos, generated_videos
+from caper_jax.evaluation.tables.videos import Videos, dataset_videos, generated_videos
 from caper_jax.evaluation.tracking import (
     Start,
     Track,
@@ -142,10 +142,8 @@ def open_videos(
       CaperError: options that contradict each other; see ``generated_videos`` and
         ``dataset_videos``.
     """
-    if options.data is None:
-        for name in ("format", "split"):
-            if getattr(options, name) is not None:
-                raise CaperError(f"--{name} goes with --data")
+    source = options.dataset()
+    if source is None:
         return generated_videos(
             options.out / "videos",
             category,
@@ -157,10 +155,8 @@ def open_videos(
     for name in ("mode", "frames"):
         if getattr(options, name) is not None:
             raise CaperError(f"--{name} is of generated videos; leave out --data or --{name}")
-    if options.format is None:
-        raise CaperError("--data needs --format, the layout of the data")
-    split = options.split or SPLIT
-    return dataset_videos(options.format, options.data, category, split, options.videos)
+    format, root, split = source
+    return dataset_videos(format, root, category, split, options.videos)
 
 
 def find_case(

@@ -19,10 +19,10 @@ from caper_jax.data.synthetic.collect import collect_videos
 from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.data.synthetic.videos import MODES, VideoGenerator
 from caper_jax.errors import CaperError
+from caper_jax.evaluation.tables.options import SPLIT
 
 # The paper's clouds have 1,024 points; its sensor noise is not stated.
 TEST_DATA = GeneratorConfig(instances=100, grid=128, num_points=1024, noise=("kinect",))
-SPLIT = "test"
 _BATCH = 2  # videos drawn at a time
 
 
