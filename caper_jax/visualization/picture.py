@@ -35,7 +35,7 @@ from caper_jax.visualization.scene import (
 TITLES = ("Depth image and mask", "Estimate over the depth image", "Seen from another side")
 DPI = 110
 ROW_HEIGHT = 3.9  # inches
-WIDTHS = (3.4, 3.4, 3.4, 3.6)  # inches: three views and the legend
+WIDTHS = (3.4, 3.4, 3.4, 4.3)  # inches: three views and the legend
 INK, PAPER, TRUTH = "#1a1a1a", "#f4f4f2", "#333333"
 
 Projection = Callable[[np.ndarray], np.ndarray]
