@@ -21,7 +21,7 @@ from caper_jax.configuration import to_dict
 from caper_jax.data.cloud import cloud_from_depth
 from caper_jax.data.images import read_depth, read_intrinsics, read_mask
 from caper_jax.errors import CaperError
-from caper_jax.estimator import Estimator, estimate, load
+from caper_jax.estimator import Estimator, estimate, load, shipped_weights
 from caper_jax.model_files import flatten, write_model
 from caper_jax.networks.canonical import view_rotation
 
@@ -370,7 +370,7 @@ def test_gradients_of_the_shipped_model(laptop, plates):
     assert abs(slope) > 0.01
 
 
-@pytest.mark.parametrize("name", ["box", "laptop"])
+@pytest.mark.parametrize("name", ["box", "laptop", "eyeglasses"])
 def test_shipped_models_find_the_demo_objects(name, laptop):
     """Unseen instances, rendered with a sensor's noise, as ``caper demo`` shows them.
 
@@ -392,3 +392,14 @@ def test_shipped_models_find_the_demo_objects(name, laptop):
             assert np.degrees(min(off)) < 15, folder.name
         assert np.linalg.norm(pose.translation - truth["translation"], axis=-1).max() < 0.03
         np.testing.assert_allclose(np.degrees(pose.joint_state), truth["joint_state"], atol=10)
+
+
+def test_every_category_ships_a_model_with_its_card():
+    """At most 30 MB together, each saying what it is and how sure it may be."""
+    folders = [shipped_weights() / name for name in categories.names()]
+    assert sum((folder / "weights.npz").stat().st_size for folder in folders) < 30e6
+    for folder in folders:
+        card = json.loads((folder / "model.json").read_text())
+        assert card["category"] == folder.name
+        assert {"run", "steps", "training_seconds_in_all", "hardware", "commit"} <= card.keys()
+        assert card["metrics"] and card["calibration"]["frames"] >= 2000
