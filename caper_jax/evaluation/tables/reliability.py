@@ -39,7 +39,8 @@ def run(name: str, options: Options) -> Report:
     """
     rows: list[list[str]] = []
     facts, result, curves = [], {}, {}
-    for category, estimator in runs.need_models(options.category, options.weights).items():
+    models = runs.need_models(options.category, options.weights, options.object_scale)
+    for category, estimator in models.items():
         source = open_frames(options, estimator.category, _FRAMES)
         missing = runs.NO_DATA if source is None else "no calibration in the model card"
         if source is None or estimator.calibration is None:

@@ -104,14 +104,17 @@ def find_model(category: str, weights: Path | None, object_scale: float = 1.0) -
     return load(category, directory, object_scale) if directory.is_dir() else None
 
 
-def need_models(names: Sequence[str], weights: Path | None) -> dict[str, Estimator]:
+def need_models(
+    names: Sequence[str], weights: Path | None, object_scale: float = 1.0
+) -> dict[str, Estimator]:
     """The models of some categories; of all that have one, where none is named.
 
     Raises:
       CaperError: a named category without a model, or no model at all.
     """
     found = {
-        categories.get(name).name: find_model(name, weights) for name in names or categories.names()
+        categories.get(name).name: find_model(name, weights, object_scale)
+        for name in names or categories.names()
     }
     missing = [name for name, model in found.items() if model is None]
     models = {name: model for name, model in found.items() if model is not None}
