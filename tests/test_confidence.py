@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import jax
 import numpy as np
 import pytest
+from frames import random_pose
 from quick import quick_jit
 from scipy.optimize import linprog
 from scipy.stats import chi
 from tiny import network, random_variables
 
 from caper_jax import categories, cli, confidence
+from caper_jax.articulation.equivalence import second_reading
 from caper_jax.configuration import to_dict
 from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.errors import CaperError
@@ -76,6 +79,25 @@ def test_covariance_is_that_of_twists():
     covariance = confidence.pose_covariance(np.array([0.1, 0.2]), np.array([0.01, 0.03]))
     twists = rng.normal(size=(20000, 6)) * np.repeat([0.2, 0.03], 3)
     np.testing.assert_allclose(covariance[1], np.cov(twists.T), atol=2e-3)
+
+
+def test_readings_of_equal_halves_count_as_the_nearer():
+    """Scissors whose halves are alike, read the other way round; and some whose are not."""
+    scissors = categories.get("scissors")
+    truth = random_pose(4, 3)
+    size = np.repeat(truth.size[:, :1], 2, 1)
+    size[3, 1] *= [1.2, 1.0, 1.0]
+    truth = dataclasses.replace(truth, size=size)
+    (equivalence,) = scissors.equivalences
+    other = second_reading(truth, equivalence, scissors)
+    rows = np.array([1, 3])
+    estimate = jax.tree.map(np.array, truth)
+    for name in vars(estimate):
+        getattr(estimate, name)[rows] = getattr(other, name)[rows]
+    found = calibration.nearer_reading(estimate, truth, scissors)
+    for name, values in vars(found).items():
+        np.testing.assert_allclose(values[:3], getattr(estimate, name)[:3], atol=1e-6)
+        np.testing.assert_allclose(values[3], getattr(truth, name)[3], atol=1e-6)
 
 
 @pytest.mark.parametrize("level", [0.5, 0.9])

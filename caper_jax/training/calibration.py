@@ -10,6 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from caper_jax.articulation.category import Category
+from caper_jax.articulation.equivalence import is_ambiguous, second_reading
+from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.confidence import COVERAGE
 from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.data.synthetic.scene import Batch, Generator
@@ -101,8 +104,28 @@ def _measure(variables, batch: Batch, estimator: Estimator):
     """(evidence [B, K, E], errors of rotation [B, K], translation [B, K], state [B, J])."""
     category = estimator.category
     prediction = estimate(variables, batch.points, category, estimator.network)
-    pose, truth = prediction.pose, batch.pose
+    pose, truth = prediction.pose, nearer_reading(prediction.pose, batch.pose, category)
     shift = (pose.translation - truth.translation) * category.unit
     state = jnp.abs(pose.joint_state - truth.joint_state) * category.state_units
     turn = so3.geodesic_distance(pose.rotation, truth.rotation)
     return prediction.evidence, turn, jnp.linalg.norm(shift, axis=-1), state
+
+
+def nearer_reading(pose: ArticulatedPose, truth: ArticulatedPose, category: Category):
+    """The truth [B, ...]; of objects that a category declares ambiguous the reading that is nearer.
+
+    Nobody can know which of equal halves bears which name: an estimate need not doubt itself there.
+    """
+    for equivalence in category.equivalences:
+        other = second_reading(truth, equivalence, category)
+        turns = [
+            so3.geodesic_distance(pose.rotation[:, 0], reading.rotation[:, 0])
+            for reading in (other, truth)
+        ]
+        nearer = is_ambiguous(truth.size, equivalence) & (turns[0] < turns[1])
+
+        def pick(new, old, nearer=nearer):
+            return jnp.where(nearer.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        truth = jax.tree.map(pick, other, truth)
+    return truth

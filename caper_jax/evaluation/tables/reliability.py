@@ -20,6 +20,7 @@ from caper_jax.evaluation.tables import runs
 from caper_jax.evaluation.tables.frames import open_frames
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.render import Curves, Report, Table, number
+from caper_jax.training.calibration import nearer_reading
 
 LEVELS = (0.5, 0.7, 0.8, COVERAGE, 0.95, 0.99)
 HEADER = ("category", "of", "part", *(f"{100 * level:.0f} %" for level in LEVELS), "median std")
@@ -70,6 +71,7 @@ def run(name: str, options: Options) -> Report:
             *facts,
             "a region is a ball about the estimate, of a rotation vector, a position or a joint "
             "state, of normally distributed errors with the stated deviation",
+            "of objects with a declared symmetry, the truth is the nearer of its two readings",
             f"calibrated for {100 * COVERAGE:.0f} %; smaller and larger shares are as the normal "
             "distribution has them",
         ],
@@ -96,7 +98,8 @@ def measure(
     # The first call was for the compiler; the last batch was filled up.
     columns = zip(*stated[1:], strict=True)
     turn, shift, state = (np.concatenate(column)[: len(found.names)] for column in columns)
-    errors = pose_errors(found.estimate, found.truth, estimator.category, found.failed)
+    truth = nearer_reading(found.estimate, found.truth, estimator.category)
+    errors = pose_errors(found.estimate, truth, estimator.category, found.failed)
     return _levels(estimator.category, errors, turn, shift, state)
 
 
