@@ -260,6 +260,17 @@ class TestStatic:
             assert cells(output, "box", share)[:3] == [count, "-", turn]
         assert OCCLUSION[0.8, 1.0] == (2.0, 0.095)
 
+    @pytest.mark.parametrize(
+        ("name", "finds"), [("table1", "find_model"), ("reliability", "need_models")]
+    )
+    def test_models_are_scaled_as_asked(self, name, finds, tmp_path, capsys, monkeypatch):
+        def refuse(*arguments):
+            raise CaperError(f"asked at scale {arguments[-1]}")
+
+        monkeypatch.setattr(runs, finds, refuse)
+        assert run(name, tmp_path, "--category", "laptop", "--object-scale", "4.5") == 2
+        assert "asked at scale 4.5" in capsys.readouterr().err
+
     def test_frames_are_those_of_generate_and_drawn_once(self, tmp_path, monkeypatch):
         small = dataclasses.replace(SMALL, num_points=64, measure_visibility=True)
         monkeypatch.setattr(frames_of_tables, "FRAME_DATA", small)
