@@ -1,0 +1,200 @@
+"""Serving without this package: a model as StableHLO, weights inside, for several platforms.
+
+The files are ``model.stablehlo`` (a portable artifact of StableHLO, as ``jax.export`` lowers it),
+``manifest.json`` and ``run.py``, which needs jax and numpy alone. The container that
+``jax.export`` would serialise is not used, as reading it takes a further package, flatbuffers.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import export
+
+from caper_jax._version import __version__
+from caper_jax.articulation.category import Category
+from caper_jax.data.cloud import MIN_POINTS
+from caper_jax.errors import CaperError, unknown_name
+from caper_jax.estimator import Estimator, Prediction
+from caper_jax.files import write_atomically
+
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+MODEL_FILE, MANIFEST_FILE, RUNNER_FILE = "model.stablehlo", "manifest.json", "run.py"
+FORMAT = 1  # of the manifest
+FRAME = "camera, OpenCV: x right, y down, z forward"
+ANY_BATCH = "batch"  # stands for the size in shapes that leave it open
+
+_SAMPLING = (
+    "leave out points that are NaN, infinite or exactly zero (of an image: keep the raster order), "
+    f"ask for {MIN_POINTS} or more of the remaining n, and take those at floor((i + 0.5) n / "
+    "num_points), i = 0 .. num_points - 1"
+)
+# Output -> (unit, meaning). K parts and J joints in the manifest's order; part 0 is the root.
+_OUTPUTS = {
+    "rotation": (
+        "1",
+        "[B, K, 3, 3] from the part's rest frame: p_camera = rotation p + translation",
+    ),
+    "translation": ("metres", "[B, K, 3] see rotation"),
+    "size": ("metres", "[B, K, 3] extents of the part's box in its rest frame"),
+    "box_center": ("metres", "[B, K, 3] centre of that box in the rest frame"),
+    "joint_axis": ("1", "[B, J, 3] unit vectors in the root's rest frame; positive states open"),
+    "joint_pivot": ("metres", "[B, J, 3] a point on the axis, in the root's rest frame"),
+    "joint_state": ("state", "[B, J] from the rest pose"),
+    "labels": ("1", "[B, num_points] part of each point"),
+    "confidence": ("1", "[B, 2] of the two directions that give the root's rotation, in (0, 1)"),
+    "degenerate": ("1", "[B] whether the rotation is arbitrary, as those directions were parallel"),
+    "seen": ("1", "[B, K] how many of the points show each part"),
+    "rotation_std": ("radians", "[B, K] standard deviation about each axis"),
+    "translation_std": ("metres", "[B, K] standard deviation along each axis"),
+    "state_std": ("state", "[B, J] standard deviation"),
+}
+_CARD = (
+    *("version", "commit", "hardware", "steps", "samples", "samples_in_all"),
+    *("training_seconds", "training_seconds_in_all"),
+)
+
+
+def flat(prediction: Prediction) -> dict[str, Any]:
+    """What an exported model gives: the arrays of a prediction by name, those that it has.
+
+    Args:
+      prediction: with any leading axes.
+
+    Returns:
+      The fields of ``ArticulatedPose`` and of ``Prediction``, but for points and evidence.
+    """
+    arrays = {**vars(prediction.pose), **vars(prediction)}
+    return {name: arrays[name] for name in _OUTPUTS if arrays[name] is not None}
+
+
+def export_estimator(
+    estimator: Estimator,
+    directory: str | Path,
+    platforms: Sequence[str] = ("cpu", "cuda"),
+    batch: int | None = 1,
+) -> dict[str, Any]:
+    """Writes an estimator as ``model.stablehlo``, ``manifest.json`` and ``run.py``.
+
+    The model takes points [B, num_points, 3], float32 metres in the camera frame, and gives a dict
+    of arrays, see ``flat``. With a fixed batch it gives what ``estimator`` gives for a batch of
+    that size; with an open one it differs as a float32 computation in another order does.
+
+    Args:
+      estimator: the model.
+      directory: created if absent; a model in it is replaced.
+      platforms: where the model is to run, of "cpu", "cuda", "rocm" and "tpu"; none of them has
+        to be at hand.
+      batch: B; None leaves it open, to be compiled for each B that comes.
+
+    Returns:
+      The manifest.
+
+    Raises:
+      CaperError: an unknown platform, none, or a batch below 1.
+    """
+    platforms = tuple(dict.fromkeys(platforms))
+    for platform in platforms:
+        if platform not in PLATFORMS:
+            raise unknown_name("platform", platform, PLATFORMS)
+    if not platforms:
+        raise CaperError(f"no platform to export for; known are {', '.join(PLATFORMS)}")
+    if batch is not None and batch < 1:
+        raise CaperError(f"batch must be 1 or more, or None to leave it open, got {batch}")
+
+    count = estimator.network.num_points
+    shape = export.symbolic_shape(f"{ANY_BATCH if batch is None else batch}, {count}, 3")
+    given = jax.ShapeDtypeStruct(shape, jnp.float32)
+    exported = export.export(jax.jit(_function(estimator)), platforms=platforms)(given)
+    content = _manifest(estimator, exported)
+
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    # The manifest goes first and comes last: it never stands beside files of another model.
+    (directory / MANIFEST_FILE).unlink(missing_ok=True)
+    write_atomically(directory / MODEL_FILE, bytes(exported.mlir_module_serialized))
+    runner = Path(__file__).parent / "assets" / "serving" / RUNNER_FILE
+    write_atomically(directory / RUNNER_FILE, runner.read_bytes())
+    text = json.dumps(content, indent=2, allow_nan=False)
+    write_atomically(directory / MANIFEST_FILE, text.encode() + b"\n")
+    return content
+
+
+def _function(estimator: Estimator) -> Callable[[Any], dict[str, Any]]:
+    def run(points):
+        # Constants that the compiler sees through it folds into the arithmetic, which rounds
+        # otherwise than the estimator's: poses by up to 1e-3 where the choice of a point flips.
+        variables = jax.lax.optimization_barrier(estimator.variables)
+        return flat(estimator.function(variables, points))
+
+    return run
+
+
+def _manifest(estimator: Estimator, exported: export.Exported) -> dict[str, Any]:
+    category, card = estimator.category, estimator.card
+    units = {"state": [_state_unit(joint.type) for joint in category.joints]}
+    (points,) = exported.in_avals
+    outputs = jax.tree.unflatten(exported.out_tree, exported.out_avals)
+    return {
+        "format": FORMAT,
+        "caper_jax": __version__,
+        "jax": jax.__version__,
+        "category": category.name,
+        "parts": _parts(category),
+        "joints": _joints(category),
+        "platforms": list(exported.platforms),
+        "inputs": {
+            "points": {
+                **_array(points),
+                "unit": "metres",
+                "frame": FRAME,
+                "sampling": _SAMPLING,
+            }
+        },
+        "outputs": {
+            name: {**_array(outputs[name]), "unit": units.get(unit, unit), "meaning": meaning}
+            for name, (unit, meaning) in _OUTPUTS.items()
+            if name in outputs
+        },
+        # Of the module, named as fields of jax.export.Exported.
+        "convention": {
+            "calling_convention_version": exported.calling_convention_version,
+            "uses_global_constants": exported.uses_global_constants,
+        },
+        "card": {name: card[name] for name in _CARD if name in card},
+    }
+
+
+def _array(aval: Any) -> dict[str, Any]:
+    shape = [size if isinstance(size, int) else str(size) for size in aval.shape]
+    return {"shape": shape, "dtype": np.dtype(aval.dtype).name}
+
+
+def _state_unit(joint_type: str) -> str:
+    return "radians" if joint_type == "revolute" else "metres"
+
+
+def _parts(category: Category) -> list[dict[str, Any]]:
+    return [
+        {"name": name, "mean_size": [float(x) for x in size]}
+        for name, size in zip(category.parts, category.mean_size, strict=True)
+    ]
+
+
+def _joints(category: Category) -> list[dict[str, Any]]:
+    return [
+        {
+            "type": joint.type,
+            "parent": category.parts[joint.parent],
+            "child": child,
+            "limits": [float(x) for x in joint.limits],
+            "unit": _state_unit(joint.type),
+        }
+        for child, joint in zip(category.parts[1:], category.joints, strict=True)
+    ]
