@@ -17,6 +17,7 @@ COMMANDS = {
     "generate": "write synthetic labelled data",
     "train": "train a category's networks, or resume a run",
     "calibrate": "calibrate what a model says about its own errors",
+    "export": "write a model that runs without this package",
     "track": "track an object through videos or a live stream",
     "evaluate": "measure a model on labelled data",
     "validate": "check labelled data and list what is wrong with it",
