@@ -32,6 +32,7 @@ from caper_jax.networks.canonical import (
 )
 from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
 from caper_jax.networks.increment import increment_transform
+from caper_jax.networks.turns import chosen_turn
 from caper_jax.networks.voting import vote
 
 # Part sizes are residuals to a mean; nothing else keeps a regression from going below zero.
@@ -114,8 +115,11 @@ def estimate(
     uncorrected = pose
     for _ in range(network.corrections):
         canonical = canonicalise(cloud, pose[:, :3, :3], pose[:, :3, 3])
-        increment = apply("parts", parts_network, canonical).increment
-        pose = se3.compose(pose, increment_transform(increment, network.increment))
+        output = apply("parts", parts_network, canonical)
+        if output.turn is not None:
+            turned = multiply(pose[:, :3, :3], chosen_turn(output.turn, network.turn_margin))
+            pose = se3.from_rt(turned, pose[:, :3, 3])
+        pose = se3.compose(pose, increment_transform(output.increment, network.increment))
     canonical = canonicalise(cloud, pose[:, :3, :3], pose[:, :3, 3])
     parts = apply("parts", parts_network, canonical)
     axis, pivot = vote(canonical, parts.heatmap, parts.offset, parts.direction)

@@ -57,3 +57,23 @@ def canonicalise(points, rotation, translation):
       translation: [B, 3].
     """
     return rotate(transpose(rotation), points - translation[:, None, :])
+
+
+def part_points(points, chosen):
+    """The chosen points, each repeated as often as fills the cloud; all of them if none is chosen.
+
+    Args:
+      points: [B, N, 3].
+      chosen: [B, N] bool.
+
+    Returns:
+      [B, N, 3].
+    """
+    chosen = chosen | ~chosen.any(axis=1, keepdims=True)
+    number = points.shape[1]
+    count = chosen.sum(axis=1, keepdims=True)
+    order = jnp.argsort(~chosen, axis=1, stable=True)
+    # Spread evenly, so that the copies keep the density of the part's surface.
+    place = jnp.arange(number)[None] * count // number
+    index = jnp.take_along_axis(order, place, axis=1)
+    return jnp.take_along_axis(points, index[..., None], axis=1)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from caper_jax.networks.fast_encoder import FastEncoder, FastEncoderConfig
 from caper_jax.networks.heads import HeadConfig, PointHead, PooledHead, unit_vectors
 from caper_jax.networks.hs_encoder import HSEncoder, HSEncoderConfig
+from caper_jax.networks.turns import NUM_TURNS
 
 IncrementKind = Literal["lie", "euclidean"]
 _INCREMENT_SIZE: dict[IncrementKind, int] = {"lie": 6, "euclidean": 9}
@@ -33,6 +34,15 @@ class NetworkConfig:
         (Eq 14), or "euclidean", two axes and a translation regressed as they are (Table 9).
       corrections: how often the single-frame estimator corrects the root pose by that increment
         before it reads the parts.
+      turn_width: channels of the head that says by which whole turn the reference is off (see
+        ``networks.turns``); 0: there is none.
+      turn_margin: how many nats a turn must lead by before the estimator makes it.
+      rotation: what stage I regresses: "decoupled", two directions (Sec 5.1.1), or "quaternion",
+        the whole rotation at once (the conventional method of Fig 11).
+      vertical_correction: share what the two directions lack of a right angle by their confidence
+        (Eq 3); else the first stays and the second gives way (ablation).
+      joints: "voting" by points (Sec 5.2.1), or "direct", axis and pivot from pooled features
+        (ablation; with ``vertical_correction`` off, the row EfficientCAPER of Table 1).
       num_points: points per cloud that the networks see.
       point_stride: in training the point-wise decoders see every so-manieth point only; they
         treat points alike, so this costs gradients, not coverage.
@@ -46,6 +56,11 @@ class NetworkConfig:
     point_heads: HeadConfig = HeadConfig()
     increment: IncrementKind = "lie"
     corrections: int = 1
+    turn_width: int = 0
+    turn_margin: float = 1.0
+    rotation: Literal["decoupled", "quaternion"] = "decoupled"
+    vertical_correction: bool = True
+    joints: Literal["voting", "direct"] = "voting"
     num_points: int = 1024
     point_stride: int = 1
 
@@ -83,15 +98,30 @@ class RootNetwork(nn.Module):
         mean = points.mean(axis=1, keepdims=True)
         features = make_encoder(self.config)(points - mean, train)
         heads = self.config.root_heads
-        raw = jnp.stack(
-            [PooledHead(4, heads, name=f"direction{i}")(features, train) for i in range(2)], axis=1
-        )
         residual = PooledHead(3, heads, with_points=True, name="translation")(features, train)
-        return RootOutput(
-            directions=unit_vectors(raw[..., 1:]),
-            confidence=jax.nn.sigmoid(raw[..., 0]),
-            translation=residual + mean[:, 0],
-        )
+        if self.config.rotation == "quaternion":
+            numbers = PooledHead(4, heads, name="quaternion")(features, train)
+            directions = quaternion_axes(numbers)
+            confidence = jnp.full(directions.shape[:2], 0.5, directions.dtype)
+        else:
+            raw = jnp.stack(
+                [PooledHead(4, heads, name=f"direction{i}")(features, train) for i in range(2)],
+                axis=1,
+            )
+            directions, confidence = unit_vectors(raw[..., 1:]), jax.nn.sigmoid(raw[..., 0])
+            if not self.config.vertical_correction:
+                confidence = jnp.broadcast_to(
+                    jnp.array([1.0, 0.0], confidence.dtype), confidence.shape
+                )
+        return RootOutput(directions, confidence, residual + mean[:, 0])
+
+
+def quaternion_axes(numbers):
+    """Two axes at right angles, [B, 2, 3], from [B, 4]: a quaternion less the identity's."""
+    w, x, y, z = jnp.moveaxis(unit_vectors(numbers + jnp.array([1.0, 0, 0, 0])), -1, 0)
+    first = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
+    second = jnp.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1)
+    return jnp.stack([first, second], axis=1)
 
 
 @flax.struct.dataclass
@@ -104,6 +134,8 @@ class PartsOutput:
 
     Attributes:
       increment: [B, 6] or [B, 9], see ``networks.increment``; zero where the reference is right.
+      turn: [B, 24] logits of ``networks.turns``: which one the reference needs, before the
+        increment; None without that head.
       segmentation: [B, N, K] logits.
       heatmap: [B, N, J] in (0, 1), weight of each point's vote (Eq 5).
       offset: [B, N, J, 3] from the point to its foot on the joint axis (Eq 4, as a vector).
@@ -114,6 +146,7 @@ class PartsOutput:
     """
 
     increment: Any
+    turn: Any
     segmentation: Any
     heatmap: Any
     offset: Any
@@ -147,21 +180,46 @@ class PartsNetwork(nn.Module):
         chosen = features.every(self.config.point_stride) if train else features
         pointwise = self.config.point_heads
         segmentation = PointHead(parts, pointwise, name="segmentation")(chosen, train)
-        votes = PointHead(7 * joints, pointwise, name="joint")(chosen, train)
-        votes = votes.reshape(batch, -1, joints, 7)
         pooled = self.config.pooled_heads
+        if self.config.joints == "voting":
+            votes = PointHead(7 * joints, pointwise, name="joint")(chosen, train)
+            votes = votes.reshape(batch, -1, joints, 7)
+            heatmap, offset, direction = (
+                jax.nn.sigmoid(votes[..., 0]),
+                votes[..., 1:4],
+                votes[..., 4:],
+            )
+        else:
+            numbers = PooledHead(6 * joints, pooled, name="joint")(features, train)
+            heatmap, offset, direction = _unanimous(
+                points[:, :: self.config.point_stride] if train else points,
+                numbers.reshape(batch, joints, 6),
+            )
         state = PooledHead(joints, pooled, name="state")(features, train)
         numbers = _INCREMENT_SIZE[self.config.increment]
         increment = PooledHead(numbers, pooled, name="increment")(features, train)
+        turn = None
+        if self.config.turn_width:
+            width = self.config.turn_width
+            narrow = HeadConfig((width, width, width), pooled.dropout, pool_first=True)
+            turn = PooledHead(NUM_TURNS, narrow, name="turn")(features, train)
         extent = PooledHead(6 * parts, pooled, name="size")(features, train)
         extent = extent.reshape(batch, parts, 6)
         return PartsOutput(
             increment=increment,
+            turn=turn,
             segmentation=segmentation,
-            heatmap=jax.nn.sigmoid(votes[..., 0]),
-            offset=votes[..., 1:4],
-            direction=votes[..., 4:],
+            heatmap=heatmap,
+            offset=offset,
+            direction=direction,
             state=state,
             size=extent[..., :3],
             center=extent[..., 3:],
         )
+
+
+def _unanimous(points, joints):
+    """Votes of [B, N, 3] points that all say the same [B, J, 6] axis and pivot."""
+    shape = (points.shape[0], points.shape[1], joints.shape[1])
+    axis = jnp.broadcast_to(joints[:, None, :, :3], (*shape, 3))
+    return jnp.ones(shape, points.dtype), joints[:, None, :, 3:] - points[:, :, None], axis

@@ -19,7 +19,8 @@ HeatmapKind = Literal["exponential", "scaled", "linear"]
 class LossWeights:
     """Weights of Eqs 22 and 23 as the paper gives them, and of the two dense joint targets.
 
-    ``heatmap`` and ``offset`` supervise Eqs 4 and 5, which the paper defines but does not weigh.
+    ``heatmap`` and ``offset`` supervise Eqs 4 and 5, which the paper defines but does not weigh;
+    ``turn`` is ours (see ``networks.turns``).
     """
 
     rotation: float = 8.0
@@ -33,6 +34,7 @@ class LossWeights:
     twist: float = 1.0
     heatmap: float = 1.0
     offset: float = 1.0
+    turn: float = 1.0
 
 
 def _per_sample(values):
@@ -175,6 +177,11 @@ def twist_loss(twist, true_twist):
     """
     error = jnp.abs(twist - true_twist)
     return error[..., :-3].mean(-1) + error[..., -3:].mean(-1)
+
+
+def turn_loss(logits, turn):
+    """Cross entropy of the whole turn that the reference is off by, [B, 24] and [B] -> [B]."""
+    return -jnp.take_along_axis(jax.nn.log_softmax(logits), turn[:, None], axis=-1)[:, 0]
 
 
 def weighted_total(weights: LossWeights, losses: dict[str, jax.Array]):

@@ -214,12 +214,14 @@ def initial_variables(
     """Stored weights in the place of random ones; CaperError where they do not fit.
 
     A model of another category gives its encoders only: outputs of its heads would begin with that
-    category's conventions, and from an axis that points the other way no gradient leads back.
+    category's conventions, and from an axis that points the other way no gradient leads back. A
+    model without a turn head gets a new one.
     """
     wanted, found = flatten(template), flatten(stored)
-    taken = [name for name in wanted if same_category or "/encoder/" in name]
+    new = {name for name in wanted if "/turn/" in name} - found.keys()
+    taken = [n for n in wanted if (same_category and n not in new) or "/encoder/" in n]
     fits = all(name in found and np.shape(found[name]) == np.shape(wanted[name]) for name in taken)
-    if not fits or (same_category and found.keys() != wanted.keys()):
+    if not fits or (same_category and found.keys() != wanted.keys() - new):
         raise CaperError(
             f"{directory}: its weights are of another network than this run's; use the same "
             "preset and network settings"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +14,17 @@ from caper_jax.articulation.equivalence import is_ambiguous, second_labels, seco
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.geometry import se3, so3
 from caper_jax.geometry.directions import rotation_from_directions
-from caper_jax.networks.canonical import canonicalise, multiply, rotate, view_rotation
+from caper_jax.networks.canonical import (
+    canonicalise,
+    multiply,
+    part_points,
+    rotate,
+    transpose,
+    view_rotation,
+)
 from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
 from caper_jax.networks.increment import increment_numbers, increment_transform
+from caper_jax.networks.turns import HALF_TURNS, NUM_TURNS, TURNS, turn_between
 from caper_jax.networks.voting import vote
 from caper_jax.training import losses
 from caper_jax.training.losses import HeatmapKind, LossWeights
@@ -36,7 +44,11 @@ class LossConfig:
       root_noise_spread: ... both times a factor drawn log-uniformly, per sample, between this
         and one over this: errors of keyframes and of motion between frames, small and large.
       predicted_root: fraction of samples canonicalised with stage I's own (detached) prediction,
-        where that is within 25 deg of the truth.
+        where that is within 25 deg of the truth; with a turn head, of the truth after a turn.
+      turned: with a turn head, fraction of samples whose reference is turned on purpose, half of
+        them by half turns; there, only turn and increment are learned.
+      root_input: what stage I sees: the "whole" object, or the "root" part's points alone, by true
+        labels (Table 7).
     """
 
     weights: LossWeights = LossWeights()
@@ -46,6 +58,8 @@ class LossConfig:
     root_noise: float = 0.03
     root_noise_spread: float = 4.0
     predicted_root: float = 0.5
+    turned: float = 0.2
+    root_input: Literal["whole", "root"] = "whole"
 
 
 class Task:
@@ -91,21 +105,35 @@ class Task:
           (loss, (new model_state, metrics)).
         """
         del progress
-        keys = jax.random.split(key, 3)
+        keys = jax.random.split(key, 4)
         unit = self.category.unit
-        view = view_rotation(batch.points)
+        seen = batch.points
+        if self.config.root_input == "root":
+            seen = part_points(batch.points, batch.labels == 0)
+        view = view_rotation(seen)
         points = rotate(view, batch.points) * unit
 
-        output, root_state = self._apply("root", params, model_state, points, keys[0])
+        output, root_state = self._apply(
+            "root", params, model_state, rotate(view, seen) * unit, keys[0]
+        )
         truth, labels, root_losses = self._choose_reading(batch, view, output)
 
-        reference = self._noisy_root(keys[1], output, truth)
+        reference, turn = self._noisy_root(keys[1], output, truth)
+        if self.network.turn_width:
+            reference, turn = self._turned(keys[3], reference, turn)
         canonical = canonicalise(points, reference[:, :3, :3], reference[:, :3, 3])
         parts, parts_state = self._apply("parts", params, model_state, canonical, keys[2])
         stride = self.network.point_stride
         parts_losses, metrics = self._parts_losses(
             canonical[:, ::stride], parts, truth, labels[:, ::stride]
         )
+        if self.network.turn_width:
+            # Seen from a turned reference, everything else would have to be said twice.
+            right = (turn == 0).astype(canonical.dtype)
+            parts_losses = {name: value * right for name, value in parts_losses.items()}
+            parts_losses["turn"] = losses.turn_loss(parts.turn, turn)
+            metrics["turn_accuracy"] = (parts.turn.argmax(-1) == turn).mean()
+            reference = se3.compose(reference, _turn_transform(turn))
         increment_loss, off = self._increment_loss(parts.increment, reference, truth)
         parts_losses["twist"] = increment_loss
         metrics["increment_deg"] = off
@@ -150,11 +178,15 @@ class Task:
     def _root_losses(self, output, truth: ArticulatedPose) -> dict[str, jax.Array]:
         axes = ["xyz".index(axis) for axis in self.category.directions]
         directions = jnp.swapaxes(truth.rotation[:, 0], -1, -2)[:, axes]
-        return {
+        found = {
             "rotation": losses.rotation_loss(output.directions, directions),
             "translation": losses.translation_loss(output.translation, truth.translation[:, 0]),
-            "confidence": losses.confidence_loss(output.confidence, output.directions, directions),
         }
+        if self.network.rotation == "decoupled" and self.network.vertical_correction:
+            found["confidence"] = losses.confidence_loss(
+                output.confidence, output.directions, directions
+            )
+        return found
 
     def _choose_reading(self, batch, view, output):
         """Truth, labels and stage I losses under the better reading of each ambiguous sample."""
@@ -190,7 +222,12 @@ class Task:
         return rotation
 
     def _noisy_root(self, key, output, truth: ArticulatedPose):
-        """[B, 4, 4] reference poses: the truth with noise, or stage I's own prediction."""
+        """Reference poses: the truth with noise, or stage I's own prediction.
+
+        Returns:
+          [B, 4, 4] and the turns [B] they are off by: none, but where a turn head may learn from
+          predictions that are.
+        """
         config = self.config
         keys = jax.random.split(key, 4)
         batch = truth.translation.shape[0]
@@ -202,12 +239,29 @@ class Task:
         rotation = multiply(truth.rotation[:, 0], so3.exp(twist))
         translation = truth.translation[:, 0] + shift
         predicted = jax.lax.stop_gradient(self._root_rotation(output))
-        off = so3.geodesic_distance(predicted, truth.rotation[:, 0])
+        if self.network.turn_width:
+            turn, off = turn_between(predicted, truth.rotation[:, 0])
+        else:
+            turn = jnp.zeros(batch, jnp.int32)
+            off = so3.geodesic_distance(predicted, truth.rotation[:, 0])
         own = jax.random.uniform(keys[2], (batch,)) < config.predicted_root
         own &= off < np.radians(25.0)
         rotation = jnp.where(own[:, None, None], predicted, rotation)
         guess = jax.lax.stop_gradient(output.translation)
-        return se3.from_rt(rotation, jnp.where(own[:, None], guess, translation))
+        reference = se3.from_rt(rotation, jnp.where(own[:, None], guess, translation))
+        return reference, jnp.where(own, turn, 0)
+
+    def _turned(self, key, reference, turn):
+        """Some references turned away from where they are, with the turns they are then off by."""
+        keys = jax.random.split(key, 4)
+        shape = turn.shape
+        half = jax.random.choice(keys[0], jnp.array(HALF_TURNS), shape)
+        some = jax.random.randint(keys[1], shape, 1, NUM_TURNS)
+        drawn = jnp.where(jax.random.bernoulli(keys[2], 0.5, shape), half, some)
+        chosen = jax.random.bernoulli(keys[3], self.config.turned, shape) & (turn == 0)
+        drawn = jnp.where(chosen, drawn, 0)
+        away = transpose(_turn_transform(drawn))  # no translation: this is its inverse
+        return se3.compose(reference, away), jnp.where(chosen, drawn, turn)
 
     def _increment_loss(self, numbers, reference, truth: ArticulatedPose):
         """Eq 21 for the increment from the reference to the true root pose (Eq 10).
@@ -241,6 +295,8 @@ class Task:
             + losses.scale_loss(output.center, truth.box_center),
             "segmentation": losses.segmentation_loss(output.segmentation, labels),
         }
+        if self.network.joints == "direct":  # nobody votes
+            del parts["heatmap"], parts["offset"]
         right = (output.segmentation.argmax(-1) == labels).sum() / jnp.maximum(
             (labels >= 0).sum(), 1
         )
@@ -250,3 +306,9 @@ class Task:
             name, factor = ("deg", 180 / np.pi) if kind == "revolute" else ("unit", 1.0)
             metrics[f"state{number + 1}_{name}"] = off[number] * factor
         return parts, metrics
+
+
+def _turn_transform(turn):
+    """[B, 4, 4] of turns [B] about the root's origin."""
+    rotation = jnp.asarray(TURNS)[turn]
+    return se3.from_rt(rotation, jnp.zeros((*turn.shape, 3), rotation.dtype))
