@@ -39,6 +39,7 @@ from caper_jax.evaluation.tables import (
     runs,
     static,
     tracking,
+    trainings,
     videos,
 )
 from caper_jax.evaluation.tables import frames as frames_of_tables
@@ -471,19 +472,21 @@ class TestIncrements:
     def test_each_run_has_its_kind_seed_and_budget(self, tmp_path, monkeypatch):
         started = []
 
-        def train(config, directory):
+        def train(config, directory, initial):
+            assert initial is None
             started.append((config, directory))
             return types.SimpleNamespace(finished=len(started) < 2)
 
-        monkeypatch.setattr(increments.training, "train", train)
+        monkeypatch.setattr(trainings.training, "train", train)
         monkeypatch.setattr(
-            increments, "load", lambda *_: types.SimpleNamespace(network=None, card={})
+            trainings, "load", lambda *_: types.SimpleNamespace(network=None, card={})
         )
         options = Options(out=tmp_path, steps=7, overrides=("training.batch_size=3",))
+        change = ("network.increment=euclidean",)
         with pytest.raises(CaperError, match="finished run of another network"):
-            increments.trained("box", "euclidean", 2, options)
+            trainings.trained("box", "euclidean", change, 2, options)
         with pytest.raises(KeyboardInterrupt):
-            increments.trained("box", "lie", 0, options)
+            trainings.trained("box", "lie", (), 0, options)
         (first, folder), (second, other) = started
         assert first.network == dataclasses.replace(second.network, increment="euclidean")
         assert (first.training.steps, first.training.minutes, first.training.seed) == (7, None, 2)
@@ -496,7 +499,8 @@ class TestIncrements:
         dataset = write_videos(tmp_path / "box.h5")
         asked = []
 
-        def trained(category, kind, seed, options):
+        def trained(category, kind, changes, seed, options):
+            assert list(changes) == [f"network.increment={kind}"]
             asked.append((kind, seed))
             return types.SimpleNamespace(card={"steps": 1000 + seed}, kind=kind, seed=seed)
 
@@ -504,7 +508,7 @@ class TestIncrements:
             assert config.registration.steps == 0
             return KnownTracker(dataset, 4.0 if estimator.kind == "lie" else 5.0, 0.0)
 
-        monkeypatch.setattr(increments, "trained", trained)
+        monkeypatch.setattr(trainings, "trained", trained)
         monkeypatch.setattr(increments, "Tracker", make)
         data = ["--data", str(tmp_path / "box.h5"), "--format", "caper"]
         assert run("table9", tmp_path, "--category", "box", "--seeds", "2", *data) == 0

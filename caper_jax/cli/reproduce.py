@@ -21,6 +21,10 @@ _TRACKING = (
     *("network_alone", "object_scale"),
 )
 _STATIC = ("category", "frames", "data", "format", "split", "weights", "seed", "object_scale")
+_TRAINED = (
+    *("category", "frames", "data", "format", "split", "seed"),
+    *("seeds", "minutes", "steps", "initial", "overrides"),
+)
 _MOVING = ("category", "videos", "frames", "weights", "seed", "network_alone")
 
 
@@ -44,6 +48,15 @@ REPRODUCTIONS = {
     "table1": Reproduction("static", "pose estimation, ArtImage categories", _STATIC),
     "table2": Reproduction("static", "pose estimation, ReArtMix categories", _STATIC),
     "table3": Reproduction("static", "pose estimation, seven parts of an arm", _STATIC),
+    "ablations": Reproduction(
+        "ablations", "table 1 without the paper's ideas; trains four models", _TRAINED
+    ),
+    "table7": Reproduction(
+        "root_pose", "the root from its own points or from the whole; trains both", _TRAINED
+    ),
+    "figure11": Reproduction(
+        "root_pose", "rotation decoupled or regressed directly; trains both", _TRAINED
+    ),
     "table8": Reproduction("occlusion", "pose estimation by how much is hidden", _STATIC),
     "table4": Reproduction(
         "tracking", "pose tracking, ReArt-Videos categories", (*_TRACKING, "given_masks")
@@ -59,7 +72,7 @@ REPRODUCTIONS = {
         "Lie against Euclidean increments; trains both",
         (
             *("category", "videos", "frames", "mode", "data", "format", "split", "seed"),
-            *("seeds", "minutes", "steps", "overrides"),
+            *("seeds", "minutes", "steps", "initial", "overrides"),
         ),
     ),
     "table10": Reproduction(
@@ -150,6 +163,15 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
         "--steps",
         {"type": common.positive_int, "help": "of training per run, instead of --minutes"},
     ),
+    "initial": (
+        "--from",
+        {
+            "type": Path,
+            "metavar": "DIR",
+            "dest": "initial",
+            "help": "model that each run starts from, as for caper train (default: none)",
+        },
+    ),
     "overrides": (
         "--set",
         {
@@ -175,6 +197,7 @@ def build_parser() -> argparse.ArgumentParser:
             ("table6 --data PM-Videos --format pm-videos", "on the paper's data"),
             ("table10 --weights runs/arm --frames 1000", "errors against frame, long videos"),
             ("table9 --category box --seeds 3 --minutes 30", "trains six models"),
+            ("table7 --category laptop --steps 4000 --seeds 1", "trains two models"),
             ("jitter --category box --videos 4", "a quick look"),
         ],
     )
@@ -225,9 +248,13 @@ def _with_machine(report: Report) -> Report:
 
 def _write_curves(options: Options, name: str, report: Report) -> list[Path]:
     """Writes the report's pictures; returns their paths."""
-    from caper_jax.visualization.curves import write_curves
+    from caper_jax.evaluation.tables.render import Curves
+    from caper_jax.visualization.curves import write_curves, write_scatter
 
     paths = {options.out / f"{name}_{end}.png": curves for end, curves in report.curves.items()}
     for path, curves in paths.items():
-        write_curves(path, curves)
+        if isinstance(curves, Curves):
+            write_curves(path, curves)
+        else:
+            write_scatter(path, curves)
     return list(paths)

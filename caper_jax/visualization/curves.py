@@ -1,14 +1,15 @@
-"""Line plots of what an evaluation measured."""
+"""Plots of what an evaluation measured: lines, and points in panels."""
 
 from __future__ import annotations
 
 import io
 from pathlib import Path
 
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from caper_jax.evaluation.tables.render import Curves
+from caper_jax.evaluation.tables.render import Curves, Scatter
 from caper_jax.files import write_atomically
 
 _SIZE, _DPI = (8.0, 4.5), 120
@@ -30,6 +31,35 @@ def write_curves(path: Path, curves: Curves) -> None:
     axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
+    _save(figure, path)
+
+
+def write_scatter(path: Path, scatter: Scatter) -> None:
+    """Writes a PNG with one panel of points per label, equal axes and one colour bar.
+
+    Args:
+      path: the file; its folder exists.
+      scatter: the points; what lies beyond the axes (98 % of all points are within) is drawn at
+        their edge.
+    """
+    figure = Figure(figsize=_SIZE, dpi=_DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(scatter.panels), sharex=True, sharey=True, squeeze=False)[0]
+    every = np.abs(np.concatenate([np.concatenate(p) for p in scatter.panels.values()]))
+    reach = max(float(np.quantile(every, 0.98)), 1e-3)
+    for axes, (label, values) in zip(panels, scatter.panels.items(), strict=True):
+        x, y, colour = (np.clip(v, -reach, reach) for v in values)
+        drawn = axes.scatter(x, y, c=colour, s=5, cmap="coolwarm", vmin=-reach, vmax=reach)
+        axes.set(title=label, xlabel=scatter.x_label, ylabel=scatter.y_label)
+        axes.set(xlim=(-1.05 * reach, 1.05 * reach), ylim=(-1.05 * reach, 1.05 * reach))
+        axes.set_aspect("equal")
+        axes.grid(alpha=0.3)
+    figure.colorbar(drawn, ax=panels, label=scatter.colour_label, shrink=0.8)
+    figure.suptitle(scatter.title)
+    _save(figure, path)
+
+
+def _save(figure: Figure, path: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     write_atomically(path, buffer.getvalue())

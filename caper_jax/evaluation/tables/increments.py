@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
 
 from caper_jax import categories
-from caper_jax.configuration import override
-from caper_jax.errors import CaperError
-from caper_jax.estimator import Estimator, load
-from caper_jax.evaluation.tables import comparison, runs
+from caper_jax.evaluation.tables import comparison, runs, trainings
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.paper import TABLES, Figures
 from caper_jax.evaluation.tables.render import Report, Table, number, spread
-from caper_jax.model_files import CARD_FILE
 from caper_jax.networks.caper import IncrementKind
 from caper_jax.tracker import Tracker, config_for
-from caper_jax.training import run as training
 
 KINDS: tuple[IncrementKind, ...] = get_args(IncrementKind)
-PRESET = "fast"
-MINUTES = 60.0
 _METRICS = (("rotation_deg", 1.0, 2), ("translation_relative", 100.0, 2))
 
 
@@ -38,8 +30,7 @@ def run(name: str, options: Options) -> Report:
       CaperError: unknown categories, settings or data; a run kept there with other settings.
       KeyboardInterrupt: training was stopped; the same call goes on from there.
     """
-    if options.steps is not None and options.minutes is not None:
-        raise CaperError("--steps and --minutes exclude each other")
+    trainings.check_budget(options)
     paper = TABLES[name]
     rows: list[list[str]] = []
     facts, result = [], {}
@@ -55,7 +46,9 @@ def run(name: str, options: Options) -> Report:
         for kind in KINDS:
             found[kind] = []
             for seed in range(options.seeds):
-                estimator = trained(key, kind, seed, options)
+                estimator = trainings.trained(
+                    key, kind, [f"network.increment={kind}"], seed, options
+                )
                 tracker = Tracker(estimator, runs.network_alone(config_for(estimator)))
                 tracks = runs.track_all(tracker, source, condition)
                 summary = runs.summarise(tracks, source, condition)
@@ -80,8 +73,7 @@ def run(name: str, options: Options) -> Report:
         facts=[
             paper.measured_on(),
             *facts,
-            f"{options.seeds} runs of each kind, {_budget(options)} each, preset {PRESET}, on "
-            "generated frames",
+            f"{options.seeds} runs of each kind, {trainings.describe(options)}",
             "tracker: the network's increments alone, without registration; first pose given",
             "trans [%]: distance of part origins over the diagonal of the object's box at rest",
             "euclidean - lie: difference of the means ± its standard error; above 0 the Lie "
@@ -90,38 +82,6 @@ def run(name: str, options: Options) -> Report:
         ],
         result={"categories": result},
     )
-
-
-def trained(category: str, kind: IncrementKind, seed: int, options: Options) -> Estimator:
-    """A model of one kind; trained now, resumed, or read where an earlier call finished it.
-
-    Raises:
-      CaperError: see ``training.run.train``.
-      KeyboardInterrupt: training was stopped before its budget was used up.
-    """
-    budget = f"{options.steps}steps" if options.steps else f"{_minutes(options):g}min"
-    directory = options.out / "runs" / f"{category}_{kind}_{budget}_seed{seed}"
-    config = training.preset(PRESET, category)
-    if options.overrides:
-        config = override(config, *options.overrides)
-    config = replace(
-        config,
-        network=replace(config.network, increment=kind),
-        training=replace(
-            config.training,
-            steps=options.steps,
-            minutes=None if options.steps else _minutes(options),
-            seed=seed,
-        ),
-    )
-    if not (directory / CARD_FILE).is_file() and not training.train(config, directory).finished:
-        raise KeyboardInterrupt
-    estimator = load(category, directory)
-    if estimator.network != config.network:
-        raise CaperError(
-            f"{directory} holds a finished run of another network; choose another --out"
-        )
-    return estimator
 
 
 def kind_rows(
@@ -176,11 +136,3 @@ def _values(found: Sequence[dict[str, Any]], part: int):
 
 def _scaled(factor: float, value: float | None) -> float | None:
     return None if value is None else factor * value
-
-
-def _minutes(options: Options) -> float:
-    return options.minutes or MINUTES
-
-
-def _budget(options: Options) -> str:
-    return f"{options.steps} steps" if options.steps else f"{_minutes(options):g} minutes"

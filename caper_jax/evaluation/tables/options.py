@@ -29,6 +29,7 @@ class Options:
       network_alone: track by the network's increment, without registration.
       seeds: runs to train of each kind.
       minutes, steps: budget of each of them; one of the two.
+      initial: model directory that each starts from, see ``training.run.train``.
       overrides: KEY=VALUE, other settings of these runs.
     """
 
@@ -48,6 +49,7 @@ class Options:
     seeds: int = 3
     minutes: float | None = None
     steps: int | None = None
+    initial: Path | None = None
     overrides: tuple[str, ...] = ()
 
     def chosen(self, known: Iterable[str]) -> list[str]:

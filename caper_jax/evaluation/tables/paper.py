@@ -172,6 +172,23 @@ TABLES = {
             ),
         },
     ),
+    "ablations": PaperTable(
+        "Table 1, CAPER++ and its forerunner EfficientCAPER (Sec 6.2)",
+        "ArtImage",
+        0,
+        1000,
+        variants={
+            "efficientcaper": {
+                "laptop": _pm((3.5, 4.0), (0.065, 0.071), (88.2, 87.9)),
+                "eyeglasses": _pm((3.1, 7.2, 5.8), (0.038, 0.109, 0.089), (91.8, 82.3, 84.3)),
+                "dishwasher": _pm((2.5, 3.1), (0.052, 0.085), (91.2, 83.9)),
+                "scissors": _pm((5.0, 5.1), (0.048, 0.099), (74.2, 69.2)),
+                "drawer": _pm(
+                    (2.0, 2.0, 2.0, 2.0), (0.041, 0.086, 0.090, 0.080), (93.2, 87.1, 87.1, 88.4)
+                ),
+            },
+        },
+    ),
     "table9": PaperTable(
         "Table 9, increments in the Lie algebra against Euclidean ones (Sec 6.4)",
         "ReArt-Videos",
@@ -228,3 +245,13 @@ TABLES = {
 # Table 8, the drawers of ArtImage by the share of a part that is occluded: (rotation [deg],
 # translation [m]), means over parts.
 OCCLUSION = {(0.0, 0.4): (1.9, 0.057), (0.4, 0.8): (2.0, 0.062), (0.8, 1.0): (2.0, 0.095)}
+
+# Table 7, the root's pose after stage I on ArtImage: category -> input -> (rotation [deg],
+# translation [m]).
+ROOT_INPUT = {
+    "laptop": {"root": (3.8, 0.087), "whole": (2.9, 0.063)},
+    "eyeglasses": {"root": (5.7, 0.103), "whole": (4.5, 0.074)},
+    "dishwasher": {"root": (20.4, 0.143), "whole": (2.5, 0.064)},
+    "scissors": {"root": (6.7, 0.088), "whole": (4.3, 0.067)},
+    "drawer": {"root": (3.9, 0.099), "whole": (1.3, 0.066)},
+}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,17 @@ class Curves:
 
 
 @dataclass(frozen=True)
+class Scatter:
+    """Points of one picture, a panel per label: label -> (x, y, colour), all with equal axes."""
+
+    title: str
+    x_label: str
+    y_label: str
+    colour_label: str
+    panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
 class Report:
     """A reproduction.
 
@@ -49,7 +60,7 @@ class Report:
     tables: Sequence[Table]
     facts: Sequence[str]
     result: dict[str, Any]
-    curves: dict[str, Curves] = field(default_factory=dict)
+    curves: Mapping[str, Curves | Scatter] = field(default_factory=dict)
 
 
 def markdown(report: Report) -> str:
