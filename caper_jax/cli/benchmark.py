@@ -14,7 +14,6 @@ from typing import Any
 from caper_jax.cli import common
 from caper_jax.cli.benchmarks import timing
 
-
 # Subcommand -> one line for --help; the module of the same name in benchmarks/ holds it.
 SUMMARIES = {
     "estimator": "clouds/s of the single-frame estimator, batch 1 and 32",

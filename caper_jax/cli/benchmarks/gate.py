@@ -78,14 +78,10 @@ def read_baseline(path: Path) -> dict[str, float]:
 
 def fallen(ratios: Mapping[str, float], baseline: Mapping[str, float]) -> list[str]:
     """Names whose ratio is less than 1 - ``LOSS`` of the baseline's; a missing one has fallen."""
-    return [
-        name for name, value in baseline.items() if ratios.get(name, 0.0) < (1 - LOSS) * value
-    ]
+    return [name for name, value in baseline.items() if ratios.get(name, 0.0) < (1 - LOSS) * value]
 
 
-def compare(
-    ratios: Mapping[str, float], baseline: Mapping[str, float]
-) -> Iterator[dict[str, Any]]:
+def compare(ratios: Mapping[str, float], baseline: Mapping[str, float]) -> Iterator[dict[str, Any]]:
     """One row per name in either; one that the baseline does not know passes."""
     slower = fallen(ratios, baseline)
     for name in dict.fromkeys((*baseline, *ratios)):

@@ -17,7 +17,8 @@ def random_estimator(category: Category, network: NetworkConfig) -> Estimator:
 
     from caper_jax.training.task import LossConfig, Task
 
-    return Estimator(category, network, Task(category, network, LossConfig()).init(jax.random.key(0)))
+    task = Task(category, network, LossConfig())
+    return Estimator(category, network, task.init(jax.random.key(0)))
 
 
 def clouds(category: Category, batch: int, num_points: int = 1024) -> np.ndarray:

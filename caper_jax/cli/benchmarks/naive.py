@@ -57,7 +57,8 @@ def formulation() -> Iterator[None]:
         "directional_max": directional_max,
         "neighbour_max": neighbour_max,
     }
-    with mock.patch.multiple(hs_encoder, **reductions), mock.patch.object(
-        caper, "HSEncoder", Encoder
+    with (
+        mock.patch.multiple(hs_encoder, **reductions),
+        mock.patch.object(caper, "HSEncoder", Encoder),
     ):
         yield

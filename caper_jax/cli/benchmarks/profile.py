@@ -11,6 +11,21 @@ from caper_jax.cli import common
 from caper_jax.cli.benchmarks import timing
 
 _POINTS = 3000  # of a cloud as it comes from a camera
+# Stage -> what is timed for it, and what of that belongs to another stage.
+ESTIMATOR = {
+    "sampling": ("sampling",),
+    "viewing frame": ("view",),
+    "stage I: encoder": ("root encoder",),
+    "stage I: heads": ("root", "root encoder"),
+    "stage II, twice: encoder": ("parts encoder",),
+    "stage II, twice: heads": ("parts", "parts encoder"),
+}
+TRACKER = {
+    "sampling": ("sampling",),
+    "stage II on the predicted pose": ("stage II",),
+    "registration": ("step", "step without registration"),
+    "energy of the keyframe": ("energy",),
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,34 +37,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Parts of the chain compiled apart and timed in turn; what remains of the whole is the rest."""
+    """Parts of the chain compiled apart and timed in turn; the rest is what remains."""
     if arguments.plot is not None:
         common.check_folder(arguments.plot.parent, "--plot")
     estimator, estimator_calls, tracker_calls = _calls(arguments.category)
     rows = []
-    for chain, calls in (("estimator", estimator_calls), ("tracker", tracker_calls)):
-        for row in stages(chain, timing.interleaved(calls, arguments.repeats)):
+    for chain, parts, calls in (
+        ("estimator", ESTIMATOR, estimator_calls),
+        ("tracker", TRACKER, tracker_calls),
+    ):
+        for row in stages(chain, parts, timing.interleaved(calls, arguments.repeats)):
             rows.append(row)
             yield {**row, "stage": f"{row['stage']:<40}", "load_average": timing.load_average()}
     if arguments.plot is not None:
         _draw(arguments.plot, rows, estimator.category.name)
 
 
-def stages(chain: str, medians: Mapping[str, float]) -> list[dict[str, Any]]:
-    """Time and share of each stage.
+def stages(
+    chain: str, parts: Mapping[str, Sequence[str]], medians: Mapping[str, float]
+) -> list[dict[str, Any]]:
+    """Time and share of each stage, and the rest of "whole".
 
     Args:
       chain: name of the whole.
-      medians: seconds of "whole" and of parts; "a < b" stands for b, of which a is a part that
-        has its own row: it gets what b takes beyond a.
+      parts: by stage, what was timed for it, and what of that is not its own.
+      medians: seconds by what was timed.
     """
     whole = medians["whole"]
-    own = {}
-    for name, seconds in medians.items():
-        if name == "whole":
-            continue
-        part, _, stage = name.rpartition(" < ")
-        own[stage] = max(seconds - (medians[part] if part else 0.0), 0.0)
+    own = {
+        stage: max(medians[timed] - sum(medians[name] for name in others), 0.0)
+        for stage, (timed, *others) in parts.items()
+    }
     own["rest"] = max(whole - sum(own.values()), 0.0)
     return [
         {
@@ -105,13 +123,11 @@ def _calls(name: str) -> tuple[Any, dict[str, Callable[[], Any]], dict[str, Call
     encoder = make_encoder(network).clone(name=None)
     estimate = {
         "sampling": lambda: estimator._sampled(raw),
-        "viewing frame": lambda: view(points),
-        "stage I: encoder": stage(encoder, "root", "encoder"),
-        "stage I: encoder < stage I: heads": stage(RootNetwork(network), "root"),
-        "stage II, twice: encoder": _twice(stage(encoder, "parts", "encoder")),
-        "stage II, twice: encoder < stage II, twice: heads": _twice(
-            stage(PartsNetwork(network, category.num_parts), "parts")
-        ),
+        "view": lambda: view(points),
+        "root encoder": stage(encoder, "root", "encoder"),
+        "root": stage(RootNetwork(network), "root"),
+        "parts encoder": _twice(stage(encoder, "parts", "encoder")),
+        "parts": _twice(stage(PartsNetwork(network, category.num_parts), "parts")),
         "whole": lambda: estimator(raw),
     }
 
@@ -139,15 +155,15 @@ def _calls(name: str) -> tuple[Any, dict[str, Callable[[], Any]], dict[str, Call
 
     track = {
         "sampling": lambda: trackers["whole"].observe(raw),
-        "stage II on the predicted pose": lambda: stage_two(
+        "stage II": lambda: stage_two(
             estimator.variables, frame.points * np.float32(unit), frame.labels, root
         ),
-        "energy of the keyframe": lambda: energy(half, labels, half, labels, size=one),
+        "energy": lambda: energy(half, labels, half, labels, size=one),
         "whole": lambda: trackers["whole"].step(
             estimator.variables, states["whole"], trackers["whole"].observe(raw)
         ),
-        "steps alone": step("alone"),
-        "steps alone < registration": step("whole"),
+        "step without registration": step("alone"),
+        "step": step("whole"),
     }
     return estimator, estimate, track
 
@@ -165,7 +181,8 @@ def _draw(path: Path, rows: Sequence[Mapping[str, Any]], category: str) -> None:
     chains = list(dict.fromkeys(row["chain"] for row in rows))
     figure = Figure(figsize=(9, 1.2 + 1.9 * len(chains)), layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, chain in zip(figure.subplots(len(chains), 1, squeeze=False)[:, 0], chains, strict=True):
+    grid = figure.subplots(len(chains), 1, squeeze=False)[:, 0]
+    for axes, chain in zip(grid, chains, strict=True):
         own = [row for row in rows if row["chain"] == chain]
         for number, row in enumerate(own):
             axes.barh(row["stage"], row["ms"], color=colormaps["tab10"](number % 10))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 from caper_jax.cli import common
@@ -75,18 +76,19 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
         jitted = {"ours": jax.jit(function)}
         if name in theirs:
             jitted["jaxlie"] = jax.jit(theirs[name])
-        calls = {key: (lambda f=f: f(argument)) for key, f in jitted.items()}
-        medians = timing.interleaved({**calls, "reference": timing.elementwise()}, arguments.repeats)
+        calls = {key: partial(f, argument) for key, f in jitted.items()}
+        calls["reference"] = timing.elementwise()
+        medians = timing.interleaved(calls, arguments.repeats)
         errors = {
             key: float(np.abs(np.asarray(f(checked)) - truth[name]).max())
             for key, f in jitted.items()
         }
         yield {
             "function": name,
-            "million_per_s": round(arguments.twists / medians["ours"] / 1e6, 2),
+            "million_per_s": _over(arguments.twists / 1e6, medians["ours"]),
             "in_sines": round(medians["ours"] / medians["reference"], 2),
-            "jaxlie_per_s": _or_dash(medians, "jaxlie", lambda s: arguments.twists / s / 1e6),
-            "ours/jaxlie": _or_dash(medians, "jaxlie", lambda s: s / medians["ours"]),
+            "jaxlie_per_s": _over(arguments.twists / 1e6, medians.get("jaxlie")),
+            "ours/jaxlie": _over(medians.get("jaxlie"), medians["ours"]),
             "target": TARGETS[name],
             "error": errors["ours"],
             "jaxlie_error": errors.get("jaxlie", "-"),
@@ -101,8 +103,8 @@ def _slope(xi: Any) -> Any:
     return np.broadcast_to(np.array([1.0, -2.0, 0.5, 0.7, -0.3, 1.5], xi.dtype), xi.shape)
 
 
-def _or_dash(medians: dict[str, float], name: str, rate: Callable[[float], float]) -> Any:
-    return round(rate(medians[name]), 2) if name in medians else "-"
+def _over(amount: float | None, seconds: float | None) -> Any:
+    return "-" if amount is None or seconds is None else round(amount / seconds, 2)
 
 
 def _jaxlie() -> dict[str, Callable[[Any], Any]]:

@@ -6,6 +6,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 
@@ -20,7 +21,7 @@ def seconds_of(call: Callable[[], Any]) -> float:
 
 def median_seconds(call: Callable[[int], Any], repeats: int) -> float:
     """Median time of ``call(0)``, ..., until its arrays are there; compile before."""
-    return statistics.median(seconds_of(lambda: call(index)) for index in range(repeats))
+    return statistics.median(seconds_of(partial(call, index)) for index in range(repeats))
 
 
 def interleaved(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
