@@ -125,8 +125,8 @@ def measured() -> dict[str, tuple[Callable[[], Any], Callable[[], Any]]]:
 
     def encoder() -> Callable[[], Any]:
         def total(weights: Any, x: Any) -> Any:
-            features = module.apply({**variables, "params": weights}, x, train=False)
-            return sum(jnp.sum(level.features**2) for level in features.levels)
+            features: Any = module.apply({**variables, "params": weights}, x, train=False)
+            return sum((jnp.sum(level.features**2) for level in features.levels), jnp.zeros(()))
 
         function = jax.jit(jax.value_and_grad(total))
         function(variables["params"], points[:1])  # traced here

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 from unittest import mock
 
 import jax
@@ -52,7 +53,7 @@ class Encoder(hs_encoder.HSEncoder):
 @contextmanager
 def formulation() -> Iterator[None]:
     """Networks traced inside are the naive ones."""
-    reductions = {
+    reductions: Any = {
         "nearest": nearest,
         "directional_max": directional_max,
         "neighbour_max": neighbour_max,

@@ -64,7 +64,7 @@ def _measure(preset: str, points: int, parts: int, batch: int, repeats: int) -> 
     network = dataclasses.replace(presets.preset(preset), num_points=points)
     estimator = random_estimator(chain(parts), network)
     rng = np.random.default_rng(0)
-    clouds = rng.uniform(-0.2, 0.2, (batch, points, 3)).astype(np.float32) + np.float32([0, 0, 1])
+    clouds = (rng.uniform(-0.2, 0.2, (batch, points, 3)) + [0.0, 0.0, 1.0]).astype(np.float32)
     function = jax.jit(estimator.function)
     compiled = function.lower(estimator.variables, clouds).compile()
     clouds = jax.device_put(clouds)

@@ -76,7 +76,9 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
         jitted = {"ours": jax.jit(function)}
         if name in theirs:
             jitted["jaxlie"] = jax.jit(theirs[name])
-        calls = {key: partial(f, argument) for key, f in jitted.items()}
+        calls: dict[str, Callable[[], Any]] = {
+            key: partial(f, argument) for key, f in jitted.items()
+        }
         calls["reference"] = timing.elementwise()
         medians = timing.interleaved(calls, arguments.repeats)
         errors = {

@@ -70,7 +70,7 @@ def step(category: str, preset: str, batch: int | None) -> tuple[int, Callable[[
     data = dataclasses.replace(config.data, instances=200)
     generator = Generator(task_category, data, split="train")
     optimizer = config.training.build_optimizer()
-    function = make_step(
+    function: Any = make_step(
         task.loss, optimizer, batch_fn=lambda key, bank: generator.draw(key, size, bank)
     )
     state = TrainState.create(task.init(jax.random.key(0)), optimizer, 0)
