@@ -52,7 +52,7 @@ def from_entries(parts: Sequence[Any], axes: int) -> jax.Array:
     return jnp.moveaxis(jnp.array(parts), range(axes), range(-axes, 0))
 
 
-def cross_of(a: Sequence[jax.Array], b: Sequence[jax.Array]) -> list[jax.Array]:
+def cross_of(a: Any, b: Any) -> list[jax.Array]:
     """Cross product of vectors given entry by entry."""
     return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
 
