@@ -187,7 +187,7 @@ class Estimator:
     ) -> None:
         self.category = category
         self.network = network
-        self.variables = jax.tree.map(jnp.asarray, variables)
+        self.variables = jax.device_put(variables)
         self.card = card or {}
         self.calibration = None
         if "calibration" in self.card:
@@ -308,11 +308,14 @@ def load(category: str, weights: str | Path | None = None, object_scale: float =
 def _check_variables(directory: Path, variables, category: Category, network: NetworkConfig):
     """Raises CaperError unless the weights are those of the card's networks, leaf by leaf."""
     points = jax.ShapeDtypeStruct((2, network.num_points, 3), jnp.float32)
-    key = jax.random.key(0)
     modules = {"root": RootNetwork(network), "parts": PartsNetwork(network, category.num_parts)}
+    collections = ["params", "batch_stats"]
     try:
+        # Without a key: drawing random weights takes longer to trace than the networks.
         shapes = {
-            name: jax.eval_shape(partial(module.init, train=False), key, points)
+            name: jax.eval_shape(
+                partial(module.apply, train=False, mutable=collections), {}, points
+            )[1]
             for name, module in modules.items()
         }
     except Exception as error:  # sizes that build no network; Flax and JAX raise many kinds

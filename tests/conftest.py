@@ -7,6 +7,8 @@ from pathlib import Path
 
 # Before anything imports jax: a GPU would be slower here, and round differently.
 os.environ["JAX_PLATFORMS"] = "cpu"
+# Commands that tests run leave the cache of whoever runs the tests alone.
+os.environ["CAPER_CACHE"] = "off"
 
 import jax
 import pytest

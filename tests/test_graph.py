@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from caper_jax.networks import graph
 from caper_jax.networks.graph import (
     directional_max,
     directions,
@@ -65,6 +66,43 @@ def test_nearest_of_another_cloud():
     order = dense_squared_distances(query, points).argsort(-1)
     np.testing.assert_array_equal(nearest(query, points, 4), order[..., :4])
     np.testing.assert_array_equal(nearest_row(query, points), order[..., 0])
+
+
+@pytest.mark.parametrize("count", [4 * 8, 4 * 8 + 3])  # whole blocks, and not
+@pytest.mark.parametrize("channels", [3, 6])
+def test_neighbours_in_blocks_are_the_same(monkeypatch, channels, count):
+    points, queries = random(2, count, channels), random(2, 11, channels, seed=1)
+    points[:, 9] = points[:, 20]  # twins in different blocks
+
+    def all_of(points, queries):
+        return (
+            nearest(points, points, 7, exclude_self=True),
+            nearest(queries, points, 5),
+            nearest_row(points, queries),
+            nearest_row(queries, points),
+        )
+
+    at_once = jax.jit(all_of)(points, queries)
+    monkeypatch.setattr(graph, "BLOCK_ABOVE", 10)
+    monkeypatch.setattr(graph, "_BLOCK", 8)
+    in_blocks = jax.jit(lambda *clouds: all_of(*clouds))(points, queries)
+    jax.tree.map(np.testing.assert_array_equal, in_blocks, at_once)
+
+    def total(points):
+        index = nearest(points, points, 7, exclude_self=True)
+        return (directions(points, index) * jnp.arange(3)).sum()
+
+    in_blocks = jax.jit(jax.grad(total))(points[..., :3])
+    monkeypatch.undo()
+    np.testing.assert_array_equal(in_blocks, jax.jit(jax.grad(lambda x: total(x)))(points[..., :3]))
+
+
+def test_many_neighbours_take_no_square_of_memory():
+    """Of 16,384 points: all distances at once would be 1 GiB."""
+    points = jax.ShapeDtypeStruct((1, 16384, 3), jnp.float32)
+    compiled = jax.jit(lambda x: nearest(x, x, 20, exclude_self=True)).lower(points).compile()
+    assert compiled.memory_analysis().temp_size_in_bytes < 150e6
+    assert " sort(" not in compiled.as_text()
 
 
 def test_ties_go_to_the_lower_row():

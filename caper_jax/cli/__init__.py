@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from caper_jax._version import __version__
-from caper_jax.cli import common
+from caper_jax.cli import cache, common
 from caper_jax.errors import unknown_name
 
 # Command -> one line for --help; the module of the same name holds it, imported only when it runs.
@@ -64,6 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return common.EXIT_USAGE
 
     def start(command_argv: Sequence[str]) -> int:
+        cache.enable()
         # Imported inside run, so that Ctrl-C during a slow import is reported like any other.
         return importlib.import_module(f"caper_jax.cli.{command}").main(command_argv)
 

@@ -7,6 +7,7 @@ round its float32 operands to TF32.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,14 +33,33 @@ def as_floating(value: ArrayLike, shape: Sequence[int], name: str) -> jax.Array:
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
     """Inner product [...] of vectors [..., D], for small D."""
-    terms = [a[..., i] * b[..., i] for i in range(a.shape[-1])]
+    a, b = entries(a, 1), entries(b, 1)
+    terms = [a[i] * b[i] for i in range(len(a))]
     return sum(terms[1:], start=terms[0])
+
+
+def entries(array: jax.Array, axes: int) -> jax.Array:
+    """The last axes first, so that array[i], or array[i, j], is one entry of all elements.
+
+    Whole rows of memory then go through the derivatives of a choice of entries, not every third
+    number: they are several times as fast on a CPU.
+    """
+    return jnp.moveaxis(array, range(-axes, 0), range(axes))
+
+
+def from_entries(parts: Sequence[Any], axes: int) -> jax.Array:
+    """The array of nested lists of entries; inverts ``entries``."""
+    return jnp.moveaxis(jnp.array(parts), range(axes), range(-axes, 0))
+
+
+def cross_of(a: Any, b: Any) -> list[jax.Array]:
+    """Cross product of vectors given entry by entry."""
+    return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
     """Cross product [..., 3] of vectors [..., 3]."""
-    pairs = ((1, 2), (2, 0), (0, 1))
-    return jnp.stack([a[..., i] * b[..., j] - a[..., j] * b[..., i] for i, j in pairs], axis=-1)
+    return from_entries(cross_of(entries(a, 1), entries(b, 1)), 1)
 
 
 def norm(vector: jax.Array) -> jax.Array:

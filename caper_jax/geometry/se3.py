@@ -50,7 +50,7 @@ def vee(matrix: ArrayLike) -> jax.Array:
 def exp(xi: ArrayLike) -> jax.Array:
     """Transform [..., 4, 4] of a twist (w, rho) [..., 6]."""
     w, rho = _split(xi)
-    first, second, third = so3.exp_coefficients(so3.trigonometry(w))
+    first, second, third = so3.exp_coefficients_of(w)
     along = dot(w, rho)
     translation = (
         first[..., None] * rho + second[..., None] * cross(w, rho) + (third * along)[..., None] * w
@@ -62,7 +62,7 @@ def log(transform: ArrayLike) -> jax.Array:
     """Twist (w, rho) [..., 6], |w| <= pi, of a transform [..., 4, 4]; see ``so3.log``."""
     transform = as_floating(transform, (4, 4), "transform")
     w, t = so3.log(transform[..., :3, :3]), transform[..., :3, 3]
-    first, second = so3.inverse_coefficients(so3.trigonometry(w))
+    first, second = so3.inverse_coefficients_of(w)
     along = dot(w, t)
     rho = first[..., None] * t - cross(w, t) / 2 + (second * along)[..., None] * w
     return jnp.concatenate([w, rho], axis=-1)

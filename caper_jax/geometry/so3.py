@@ -27,11 +27,27 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from caper_jax.geometry.linalg import apply as apply
-from caper_jax.geometry.linalg import as_floating, multiply, norm, transpose
+from caper_jax.geometry.linalg import (
+    as_floating,
+    cross_of,
+    dot,
+    entries,
+    from_entries,
+    multiply,
+    norm,
+    transpose,
+)
 
 # Below this t^2 the power series are used; their terms fall by 1/24 or faster.
 _SERIES_BELOW = 1.0
 _SERIES_TERMS = 12
+
+# |B_2k| / (2k)!, Bernoulli numbers; each is 1 / (4 pi^2) of the one before.
+_BERNOULLI = (
+    *(1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160),
+    *(691 / 1307674368000, 1 / 74724249600, 3617 / 10670622842880000),
+    *(43867 / 5109094217170944000, 174611 / 802857662698291200000),
+)
 
 # hat of the unit vectors. Constants and broadcasting compile to one loop, stacked entries to nine.
 _GENERATORS = np.array(
@@ -63,7 +79,11 @@ def exp(w: ArrayLike) -> jax.Array:
     Args:
       w: [..., 3] axis times angle, radians; any length.
     """
-    w = as_floating(w, (3,), "w")
+    return _exp(as_floating(w, (3,), "w"))
+
+
+@jax.custom_jvp
+def _exp(w: jax.Array) -> jax.Array:
     terms = trigonometry(w)
     first, second, _ = exp_coefficients(terms)
     # The diagonal has two forms. 1 - c (y^2 + z^2) is exact near the identity; for an angle near
@@ -75,12 +95,28 @@ def exp(w: ArrayLike) -> jax.Array:
     return _with_diagonal(diagonal, _off_diagonal(w, first, second))
 
 
+@_exp.defjvp
+def _exp_jvp(primals, tangents):
+    (w,), (change,) = primals, tangents
+    rotation = _exp(w)
+    _, first, second = exp_coefficients(trigonometry(w))
+    v = _twice_across(entries(w, 1), entries(change, 1), first, second)
+    columns = [cross_of(v, column) for column in entries(rotation, 2).swapaxes(0, 1)]
+    return rotation, from_entries([[column[i] for column in columns] for i in range(3)], 2)
+
+
 def log(rotation: ArrayLike) -> jax.Array:
     """Rotation vector [..., 3], of length at most pi, of a rotation matrix [..., 3, 3].
 
     At exactly pi the vector and its negative are the same rotation, and either may be returned.
+    Derivatives are right along rotations; of another change, its part along them counts.
     """
-    q = _quaternion(as_floating(rotation, (3, 3), "rotation"))
+    return _log(as_floating(rotation, (3, 3), "rotation"))
+
+
+@jax.custom_jvp
+def _log(rotation: jax.Array) -> jax.Array:
+    q = _quaternion(rotation)
     real, vector = q[..., 0], q[..., 1:]
     squared, parts = _squared_length(vector)
     # w = 2 atan2(|v|, r) v / |v|; for |v| < 0.02 r as a series in (|v| / r)^2.
@@ -100,6 +136,25 @@ def log(rotation: ArrayLike) -> jax.Array:
     rest = jax.lax.stop_gradient((rest + jnp.where(beyond, half_rest, 0.0)) / length)
     ratio, rest = jnp.where(small, series, ratio), jnp.where(small, 0.0, rest)
     return 2 * (ratio[..., None] * vector + rest[..., None] * vector)
+
+
+@_log.defjvp
+def _log_jvp(primals, tangents):
+    (rotation,), (change,) = primals, tangents
+    w = _log(rotation)
+    _, second = inverse_coefficients(trigonometry(w))
+    # The skew part of change R^T, as a sum over columns.
+    columns = zip(*(entries(r, 2).swapaxes(0, 1) for r in (rotation, change)), strict=True)
+    turns = [cross_of(old, new) for old, new in columns]
+    turned = [(a + b + c) / 2 for a, b, c in zip(*turns, strict=True)]
+    return w, from_entries(_twice_across(entries(w, 1), turned, -0.5, second), 1)
+
+
+def _twice_across(w, v, first, second) -> list[jax.Array]:
+    """``rodrigues(w, first, second) v``, entry by entry: v + first w x v + second w x (w x v)."""
+    once = cross_of(w, v)
+    twice = cross_of(w, once)
+    return [v[i] + first * once[i] + second * twice[i] for i in range(3)]
 
 
 def left_jacobian(w: ArrayLike) -> jax.Array:
@@ -193,16 +248,53 @@ def exp_coefficients(terms: Trigonometry) -> tuple[jax.Array, jax.Array, jax.Arr
     )
 
 
+@jax.custom_jvp
+def exp_coefficients_of(w: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """``exp_coefficients`` of vectors [..., 3], whose derivatives are again such coefficients."""
+    return exp_coefficients(trigonometry(w))
+
+
+@exp_coefficients_of.defjvp
+def _exp_coefficients_jvp(primals, tangents):
+    # With a = (1 - cos t) / s and so on, s = t^2, each is 1 / n! - s times the one after the next.
+    (w,), (change,) = primals, tangents
+    terms = trigonometry(w)
+    first, second, third = exp_coefficients(terms)
+
+    def after(n: int, before: jax.Array) -> jax.Array:
+        series = alternating_series(lambda k: 1 / math.factorial(2 * k + n + 2), terms)
+        return jnp.where(terms.small, series, (1 / math.factorial(n) - before) / terms.squared)
+
+    fourth, fifth = after(2, second), after(3, third)
+    slope = dot(w, change)
+    changes = ((third - second) * slope, (2 * fourth - third) * slope, (3 * fifth - fourth) * slope)
+    return (first, second, third), changes
+
+
+@jax.custom_jvp
+def inverse_coefficients_of(w: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """``inverse_coefficients`` of vectors [..., 3]."""
+    return inverse_coefficients(trigonometry(w))
+
+
+@inverse_coefficients_of.defjvp
+def _inverse_coefficients_jvp(primals, tangents):
+    (w,), (change,) = primals, tangents
+    terms = trigonometry(w)
+    first, second = inverse_coefficients(terms)
+    slope = 2 * dot(w, change)
+    slope_first = (first * second - 0.25) / 2
+    weighted = [k * c for k, c in enumerate(_BERNOULLI)][1:]
+    slope_second = jnp.where(
+        terms.small, _horner(weighted, terms.series), -(slope_first + second) / terms.squared
+    )
+    return (first, second), (slope_first * slope, slope_second * slope)
+
+
 def inverse_coefficients(terms: Trigonometry) -> tuple[jax.Array, jax.Array]:
     """c = (t / 2) cot(t / 2) and (1 - c) / t^2, each [...]."""
     small, x, t, squared, sin, cos = terms
-    # |B_2k| / (2k)!, Bernoulli numbers; each term is 1 / (4 pi^2) of the one before.
-    bernoulli = (
-        *(1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160),
-        *(691 / 1307674368000, 1 / 74724249600, 3617 / 10670622842880000),
-        *(43867 / 5109094217170944000, 174611 / 802857662698291200000),
-    )
-    series = _horner(bernoulli, x)
+    series = _horner(_BERNOULLI, x)
     first = jnp.where(small, 1 - x * series, t * sin / (2 * (1 - cos)))
     return first, jnp.where(small, series, (1 - first) / squared)
 

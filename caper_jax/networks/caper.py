@@ -57,7 +57,7 @@ class NetworkConfig:
     increment: IncrementKind = "lie"
     corrections: int = 1
     turn_width: int = 0
-    turn_margin: float = 1.0
+    turn_margin: float = 0.0
     rotation: Literal["decoupled", "quaternion"] = "decoupled"
     vertical_correction: bool = True
     joints: Literal["voting", "direct"] = "voting"

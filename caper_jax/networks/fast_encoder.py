@@ -17,6 +17,7 @@ import jax.numpy as jnp
 
 from caper_jax.networks.features import Features, Level
 from caper_jax.networks.graph import squared_distances
+from caper_jax.networks.layers import BatchNorm, Dense
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ class FastEncoder(nn.Module):
         config = self.config
 
         def norm_relu(features):
-            return nn.relu(nn.BatchNorm(use_running_average=not train, momentum=0.9)(features))
+            return nn.relu(BatchNorm(use_running_average=not train, momentum=0.9)(features))
 
         centers = points[:, :: max(1, points.shape[1] // config.centers)][:, : config.centers]
         middle = points.mean(axis=1, keepdims=True)
@@ -100,14 +101,14 @@ class FastEncoder(nn.Module):
         local = [local_moments(centers, window, radius * scale) for scale in config.scales]
         relative = (centers - middle) / radius[:, None, None]
         features = jnp.concatenate([*local, centers, relative], -1)
-        features = norm_relu(nn.Dense(config.width)(features))
-        features = norm_relu(nn.Dense(config.width)(features))
+        features = norm_relu(Dense(config.width)(features))
+        features = norm_relu(Dense(config.width)(features))
         for _ in range(config.blocks):
             shared = jnp.concatenate([features.max(axis=1), features.mean(axis=1)], -1)
-            mixed = nn.Dense(config.width)(features)
-            mixed += nn.Dense(config.width, use_bias=False)(shared)[:, None, :]
+            mixed = Dense(config.width)(features)
+            mixed += Dense(config.width, use_bias=False)(shared)[:, None, :]
             features += norm_relu(mixed)
-        last = norm_relu(nn.Dense(config.last)(features))
+        last = norm_relu(Dense(config.last)(features))
         # Interpolation, not the nearest centre: smooth in the points, and a matrix product.
         window = radius * config.scales[0]
         closeness = -squared_distances(points, centers) / (2.0 * window * window)[:, None, None]

@@ -9,6 +9,7 @@ import flax.struct
 import jax.numpy as jnp
 
 from caper_jax.networks.graph import gather
+from caper_jax.networks.layers import Dense
 
 
 @flax.struct.dataclass
@@ -81,11 +82,11 @@ class BlockDense(nn.Module):
         total: Any = 0.0
         for number, level in enumerate(features.levels):
             bias = number == 0
-            part = nn.Dense(self.width, use_bias=bias, name=f"level{number}")(level.features)
+            part = Dense(self.width, use_bias=bias, name=f"level{number}")(level.features)
             total += level.at_points(part)
         if self.with_points:
-            total += nn.Dense(self.width, use_bias=False, name="points")(features.points)
+            total += Dense(self.width, use_bias=False, name="points")(features.points)
         if features.shared is not None:
-            shared = nn.Dense(self.width, use_bias=False, name="shared")(features.shared)
+            shared = Dense(self.width, use_bias=False, name="shared")(features.shared)
             total += shared[:, None, :]
         return total

@@ -11,6 +11,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+BLOCK_ABOVE = 4096  # points, beyond which distances are not held all at once
+_BLOCK = 512  # queries whose distances are
+
 
 def squared_distances(a, b):
     """[B, N, C], [B, M, C] -> [B, N, M] squared distances."""
@@ -33,16 +36,43 @@ def nearest(query, points, k: int, exclude_self: bool = False):
     No gradient passes through the choice. With ``exclude_self`` query and points are the same
     array and no point is its own neighbour.
     """
-    distance = squared_distances(lax.stop_gradient(query), lax.stop_gradient(points))
-    if exclude_self:
-        # Masking the diagonal, not top_k(k + 1)[1:]: the slice turns top_k into a full sort.
-        distance += jnp.diag(jnp.full(distance.shape[-1], jnp.inf, distance.dtype))
-    return lax.top_k(-distance, k)[1]
+
+    def choose(distance, first):
+        if exclude_self:
+            # Masking the diagonal, not top_k(k + 1)[1:]: the slice turns top_k into a full sort.
+            own = first + jnp.arange(distance.shape[1])
+            itself = own[:, None] == jnp.arange(distance.shape[2])
+            distance = jnp.where(itself, jnp.inf, distance)
+        return lax.top_k(-distance, k)[1]
+
+    return _by_distance(choose, query, points)
 
 
 def nearest_row(query, points):
     """Index [B, N] of the nearest of ``points`` [B, M, C] to each ``query`` [B, N, C]."""
-    return squared_distances(lax.stop_gradient(query), lax.stop_gradient(points)).argmin(-1)
+    return _by_distance(lambda distance, _: distance.argmin(-1), query, points)
+
+
+def _by_distance(choose, query, points):
+    """``choose(squared distances [B, n, M], number of the first of the n queries)`` of all queries.
+
+    Up to ``BLOCK_ABOVE`` points of all at once, else of blocks of queries in turn, so that memory
+    grows with the number of points, not with its square.
+    """
+    query, points = lax.stop_gradient(query), lax.stop_gradient(points)
+    batch, count, channels = query.shape
+    if max(count, points.shape[1]) <= BLOCK_ABOVE:
+        return choose(squared_distances(query, points), 0)
+    blocks = -(-count // _BLOCK)
+    padded = jnp.pad(query, ((0, 0), (0, blocks * _BLOCK - count), (0, 0)))
+    rows = jnp.moveaxis(padded.reshape(batch, blocks, _BLOCK, channels), 1, 0)
+
+    def one(block):
+        first, own = block
+        return choose(squared_distances(own, points), first)
+
+    chosen = jnp.moveaxis(lax.map(one, (jnp.arange(blocks) * _BLOCK, rows)), 0, 1)
+    return chosen.reshape(batch, blocks * _BLOCK, *chosen.shape[3:])[:, :count]
 
 
 def smallest(squared):

@@ -8,6 +8,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from caper_jax.networks.features import BlockDense, Features
+from caper_jax.networks.layers import BatchNorm, Dense
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class HeadConfig:
 
 
 def _norm_relu(features, train: bool):
-    return nn.relu(nn.BatchNorm(use_running_average=not train, momentum=0.9)(features))
+    return nn.relu(BatchNorm(use_running_average=not train, momentum=0.9)(features))
 
 
 class PooledHead(nn.Module):
@@ -53,14 +54,14 @@ class PooledHead(nn.Module):
             hidden = jnp.concatenate([rows.max(axis=1), rows.mean(axis=1)], -1)
             # Leaky: without a norm before them, plain rectifiers can all die in the first steps,
             # and the head then predicts one constant for every cloud.
-            hidden = nn.leaky_relu(nn.Dense(first)(hidden))
-            hidden = nn.leaky_relu(nn.Dense(second)(hidden))
+            hidden = nn.leaky_relu(Dense(first)(hidden))
+            hidden = nn.leaky_relu(Dense(second)(hidden))
         else:
             hidden = _norm_relu(BlockDense(first, self.with_points)(features), train)
-            hidden = _norm_relu(nn.Dense(second)(hidden), train).max(axis=1)
-            hidden = _norm_relu(nn.Dense(third)(hidden), train)
+            hidden = _norm_relu(Dense(second)(hidden), train).max(axis=1)
+            hidden = _norm_relu(Dense(third)(hidden), train)
         hidden = nn.Dropout(self.config.dropout, deterministic=not train)(hidden)
-        return nn.Dense(self.outputs)(hidden)
+        return Dense(self.outputs)(hidden)
 
 
 class PointHead(nn.Module):
@@ -79,9 +80,9 @@ class PointHead(nn.Module):
         """Features -> [B, N, outputs]."""
         first, second, _ = self.config.widths
         hidden = _norm_relu(BlockDense(first, with_points=True)(features), train)
-        hidden = _norm_relu(nn.Dense(second)(hidden), train)
+        hidden = _norm_relu(Dense(second)(hidden), train)
         hidden = nn.Dropout(self.config.dropout, deterministic=not train)(hidden)
-        return nn.Dense(self.outputs)(hidden)
+        return Dense(self.outputs)(hidden)
 
 
 def unit_vectors(raw):

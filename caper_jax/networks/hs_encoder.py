@@ -18,6 +18,7 @@ from caper_jax.networks.graph import (
     nearest_row,
     neighbour_max,
 )
+from caper_jax.networks.layers import BatchNorm, Dense, Weights
 
 
 @dataclass(frozen=True)
@@ -61,11 +62,11 @@ class OutlierRobust(nn.Module):
         """features [B, N, C], around [B, N, k] neighbours in space -> [B, N, C]."""
         channels = features.shape[-1]
         shared = neighbour_max(features, around).mean(1, keepdims=True)
-        own = nn.Dense(channels, use_bias=False, name="own")(features)
-        return features + own + nn.Dense(channels, use_bias=False, name="shared")(shared)
+        own = Dense(channels, use_bias=False, name="own")(features)
+        return features + own + Dense(channels, use_bias=False, name="shared")(shared)
 
 
-class HSLayer(nn.Module):
+class HSLayer(Weights, nn.Module):
     """One hybrid-scope layer; the surface layer when it gets no features.
 
     Attributes:
@@ -96,13 +97,13 @@ class HSLayer(nn.Module):
         weights = weights / jnp.maximum(jnp.linalg.norm(weights, axis=0), 1e-12)
         toward = directions(points, scope)
         if features is None:
-            skip = nn.Dense(self.channels, use_bias=False, name="skip")(points)
+            skip = Dense(self.channels, use_bias=False, name="skip")(points)
             center: Any = 0.0
             active = directional_max(toward, scope, None, weights)
         else:
-            skip = nn.Dense(self.channels, use_bias=False, name="skip")(features)
+            skip = Dense(self.channels, use_bias=False, name="skip")(features)
             kernel = _uniform(bound)
-            dense = nn.Dense(
+            dense = Dense(
                 width + self.channels, kernel_init=kernel, bias_init=kernel, name="support"
             )(features)
             center, support = dense[..., : self.channels], dense[..., self.channels :]
@@ -134,7 +135,7 @@ class HSEncoder(nn.Module):
         ]
 
         def normalise(features, number):
-            norm = nn.BatchNorm(use_running_average=not train, momentum=0.9, name=f"norm{number}")
+            norm = BatchNorm(use_running_average=not train, momentum=0.9, name=f"norm{number}")
             return nn.relu(norm(features))
 
         def scope(features, around, k):

@@ -1,0 +1,63 @@
+"""``caper benchmark generator``: how fast labelled frames are drawn."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from typing import Any
+
+from caper_jax.cli import common
+from caper_jax.cli.benchmarks import timing
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--category", action="append", help="may be repeated (default: all)")
+    parser.add_argument(
+        "--grid",
+        action="append",
+        type=common.positive_int,
+        help="rays per side, may be repeated (default: 96 and 128)",
+    )
+    parser.add_argument(
+        "--batch", type=common.positive_int, default=24, help="frames (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--repeats", type=common.positive_int, default=30, help="batches (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="another value of the [data] section, e.g. table=0.5, may be repeated",
+    )
+
+
+def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Frames per second of ``Generator.batch``, with Kinect noise."""
+    import jax
+
+    from caper_jax import categories
+    from caper_jax.configuration import override
+    from caper_jax.data.synthetic.config import GeneratorConfig
+    from caper_jax.data.synthetic.scene import Generator
+
+    chosen = [categories.get(name) for name in arguments.category or categories.names()]
+    for category in chosen:
+        for grid in arguments.grid or (96, 128):
+            config = override(GeneratorConfig(instances=200, grid=grid), *arguments.set)
+            generator = Generator(category, config)
+
+            def call(index, generator=generator):
+                return generator.batch(jax.random.key(index), arguments.batch)
+
+            compiling = timing.median_seconds(call, 1)
+            seconds = timing.median_seconds(call, arguments.repeats)
+            yield {
+                "category": category.name,
+                "grid": config.grid,
+                "frames_per_s": round(arguments.batch / seconds, 1),
+                "ms_per_batch": round(1000 * seconds, 2),
+                "compile_s": round(compiling, 1),
+                "load_average": timing.load_average(),
+            }

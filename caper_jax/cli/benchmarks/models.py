@@ -1,0 +1,52 @@
+"""Estimators and clouds to measure with: shipped weights, or random ones where none are needed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from caper_jax.articulation.category import Category
+from caper_jax.estimator import Estimator
+from caper_jax.networks.caper import NetworkConfig
+
+
+def random_estimator(category: Category, network: NetworkConfig) -> Estimator:
+    """With the weights that training begins from."""
+    import jax
+
+    from caper_jax.training.task import LossConfig, Task
+
+    task = Task(category, network, LossConfig())
+    return Estimator(category, network, task.init(jax.random.key(0)))
+
+
+def clouds(category: Category, batch: int, num_points: int = 1024) -> np.ndarray:
+    """Generated clouds [batch, num_points, 3] with Kinect noise, metres."""
+    import jax
+
+    from caper_jax.data.synthetic.config import GeneratorConfig
+    from caper_jax.data.synthetic.scene import Generator
+
+    config = GeneratorConfig(instances=batch, noise=("kinect",), num_points=num_points)
+    generator = Generator(category, config, split="test")
+    return np.asarray(generator.batch(jax.random.key(0), batch).points)
+
+
+def chain(parts: int) -> Category:
+    """A category of so many equal boxes in a row, each hinged to the one before."""
+    import dataclasses
+
+    from caper_jax import categories
+    from caper_jax.articulation.category import Joint
+
+    joints: Any = tuple(Joint("revolute", k, (0.0, 1.5)) for k in range(parts - 1))
+    return dataclasses.replace(
+        categories.get("box"),
+        name=f"chain{parts}",
+        parts=tuple(f"link{k}" for k in range(parts)),
+        joints=joints,
+        mean_size=((0.1, 0.1, 0.1),) * parts,
+        mean_center=tuple((0.0, 0.0, 0.1 * k) for k in range(parts)),
+        equivalences=(),
+    )
