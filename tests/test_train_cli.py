@@ -18,6 +18,7 @@ from caper_jax.configuration import update
 from caper_jax.errors import CaperError
 from caper_jax.model_files import read_model
 from caper_jax.training import run
+from caper_jax.visualization.curves import training_curves
 
 pytestmark = pytest.mark.xdist_group("train_cli")
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,6 +60,11 @@ def test_a_run_leaves_a_model_with_its_card(model):
     lines = [json.loads(line) for line in (model / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [5, 10]
     assert all(math.isfinite(line["loss"]) and line["skipped"] == 0 for line in lines)
+    assert (model / "curves.png").stat().st_size > 10_000
+    lines[0]["root_deg"] = None  # a line of skipped steps
+    drawn = training_curves("title", lines).lines
+    np.testing.assert_array_equal(drawn["root [deg]"], [[10], [lines[1]["root_deg"]]])
+    np.testing.assert_array_equal(drawn["loss"], [[5, 10], [line["loss"] for line in lines]])
 
 
 def test_a_file_feeds_a_run_that_resumes_where_it_was(tmp_path, capsys):

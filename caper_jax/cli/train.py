@@ -24,7 +24,7 @@ def build_parser() -> argparse.ArgumentParser:
         "train",
         "Trains both stages of a category on endless generated data. The same command resumes a\n"
         "run that was stopped or killed. Writes metrics.jsonl and checkpoints, and at the end a\n"
-        "model (weights.npz, model.json) for --weights of the other commands.",
+        "model (weights.npz, model.json) for --weights of the other commands, and curves.png.",
         [
             ("--category box --minutes 30 --out runs/box", "the fast preset, half an hour"),
             ("--category box --config configs/fast.toml --minutes 30 --out runs/box", ""),
@@ -108,7 +108,21 @@ def _train(category: str, arguments: argparse.Namespace, out: Path, initial: Pat
         print(f"stopped at step {steps}; the same command goes on from there")
         return common.EXIT_INTERRUPTED
     print(f"trained {steps} steps; model written to {out}")
+    _plot(category, out)
     return 0
+
+
+def _plot(category: str, out: Path) -> None:
+    """Writes curves.png beside the metrics it shows."""
+    import jax
+
+    from caper_jax.training.metrics_log import FILE, read_metrics
+    from caper_jax.visualization.curves import training_curves, write_curves
+
+    if jax.process_index() or not (out / FILE).is_file():
+        return
+    if rows := read_metrics(out / FILE):
+        write_curves(out / "curves.png", training_curves(f"Training of {category}", rows))
 
 
 def _configuration(category: str, arguments: argparse.Namespace) -> RunConfig:

@@ -13,6 +13,7 @@ PRESETS: dict[str, NetworkConfig] = {
         root_heads=HeadConfig(widths=(256, 256, 256), dropout=0.0, pool_first=True),
         pooled_heads=HeadConfig(widths=(256, 256, 256), dropout=0.0, pool_first=True),
         point_heads=HeadConfig(widths=(64, 64, 64), dropout=0.0),
+        turn_width=64,
         point_stride=4,
     ),
 }

@@ -19,7 +19,7 @@ from caper_jax.errors import CaperError
 from caper_jax.progress import progress as progress_display
 from caper_jax.training import parallel
 from caper_jax.training.checkpoints import Checkpoints
-from caper_jax.training.metrics_log import MetricsLog
+from caper_jax.training.metrics_log import FILE, MetricsLog
 from caper_jax.training.optimizer import Optimizer, OptimizerName, flat_and_anneal
 from caper_jax.training.run_directory import check_configuration
 from caper_jax.training.signals import StopRequest
@@ -199,7 +199,7 @@ class _Run:
         self.elapsed_before = float(state.elapsed)
         self.began = self.saved_at = time.monotonic()
         self.metrics = MetricsLog(
-            directory / "metrics.jsonl" if jax.process_index() == 0 else None,
+            directory / FILE if jax.process_index() == 0 else None,
             self.step,
             config.log_steps,
             config.batch_size,

@@ -11,6 +11,8 @@ from typing import Any
 
 from caper_jax.errors import CaperError
 
+FILE = "metrics.jsonl"
+
 
 class MetricsLog:
     """Appends to metrics.jsonl, every ``every`` steps.

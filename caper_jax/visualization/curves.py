@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -32,6 +34,23 @@ def write_curves(path: Path, curves: Curves) -> None:
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     _save(figure, path)
+
+
+def training_curves(title: str, rows: Sequence[dict[str, Any]]) -> Curves:
+    """Loss, and errors in degrees, of a run against its steps.
+
+    Args:
+      title: of the picture.
+      rows: lines of metrics.jsonl, at least one.
+    """
+    lines = {}
+    for name in ("loss", *(key for key in rows[-1] if key.endswith("_deg"))):
+        found = [(row["step"], row[name]) for row in rows if row.get(name) is not None]
+        if found:
+            step, value = np.array(found, float).T
+            label = f"{name[:-4].replace('_', ' ')} [deg]" if name.endswith("_deg") else name
+            lines[label] = (step, value)
+    return Curves(title, "step", "mean over the batches between two lines", lines)
 
 
 def write_scatter(path: Path, scatter: Scatter) -> None:
