@@ -26,7 +26,7 @@ SUMMARIES = {
     "start": "seconds of the import and to a first pose, with and without kept programs",
     "scaling": "time and memory as points, parts and batch grow",
     "profile": "what takes the time in the estimator and in the tracker",
-    "gate": "ratios to plain computations against the committed ones; fails on a loss of 25 %",
+    "gate": "ratios to plain computations against the committed ones; fails on a loss of a quarter",
 }
 
 
