@@ -174,7 +174,13 @@ def test_a_chain_of_parts():
     np.testing.assert_allclose(poses[-1][:3, :3], np.eye(3), atol=1e-6)
 
 
-@pytest.mark.parametrize("name", benchmark.SUMMARIES)
+def test_benchmarks_are_listed(capsys):
+    assert cli.main(["benchmark", "--help"]) == 0
+    output = capsys.readouterr().out
+    assert all(f"    {name}" in output for name in benchmark.SUMMARIES)
+
+
+@pytest.mark.parametrize("name", [*benchmark.SUMMARIES, "--gate"])
 def test_every_benchmark_has_help(name, capsys):
     assert cli.main(["benchmark", name, "--help"]) == 0
     assert "--json" in capsys.readouterr().out

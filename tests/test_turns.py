@@ -175,6 +175,32 @@ def test_direct_joints_are_what_the_votes_come_to():
     np.testing.assert_allclose(pivot, numbers[..., 3:], atol=1e-5)
 
 
+def test_direct_joints_find_back_from_the_opposite_axis():
+    """The loss of a unit vector has no slope there."""
+    config = dataclasses.replace(network("fast", pool_first=True), joints="direct")
+    made = Task(BOX, config, LossConfig())
+    batch = frames(BOX, [DEEP, DEEP])
+    truth = made._targets(batch.pose, jnp.broadcast_to(jnp.eye(3), (2, 3, 3)))
+    ones = jnp.ones(batch.labels.shape)[..., None]
+
+    def loss(axis):
+        output = SimpleNamespace(
+            segmentation=jnp.zeros((*batch.labels.shape, 2)),
+            heatmap=ones,
+            offset=truth.joint_pivot[:, None] - batch.points[:, :, None],
+            direction=jnp.broadcast_to(axis[:, None], (*ones.shape, 3)),
+            state=truth.joint_state,
+            size=truth.size,
+            center=truth.box_center,
+        )
+        parts, _ = made._parts_losses(batch.points, output, truth, batch.labels)
+        assert "heatmap" not in parts and "offset" not in parts
+        return parts["direction"].sum()
+
+    slope = jax.grad(loss)(-truth.joint_axis)
+    assert (np.asarray((slope * truth.joint_axis).sum(-1)) < -0.1).all()
+
+
 def test_points_of_a_part_fill_the_cloud_evenly():
     points = normal(2, 12, 3)
     chosen = np.zeros((2, 12), bool)

@@ -297,6 +297,8 @@ class Task:
         }
         if self.network.joints == "direct":  # nobody votes
             del parts["heatmap"], parts["offset"]
+            # Not of unit length: from an axis that points the other way no gradient leads back.
+            parts["direction"] = losses.direction_loss(output.direction[:, 0], truth.joint_axis)
         right = (output.segmentation.argmax(-1) == labels).sum() / jnp.maximum(
             (labels >= 0).sum(), 1
         )
