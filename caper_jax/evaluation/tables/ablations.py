@@ -12,7 +12,7 @@ from caper_jax.evaluation.tables.frames import open_frames
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.paper import TABLES, Figures
 from caper_jax.evaluation.tables.render import Report, Table, number
-from caper_jax.evaluation.tables.static import pair
+from caper_jax.evaluation.tables.static import joint_cells, pair
 
 # Name -> the settings that take the idea away.
 VARIANTS = {
@@ -95,22 +95,12 @@ def variant_rows(
         if paper is not None:
             other = paper.beside(index)
             turn, shift = paper.rotation_deg[other], 100 * paper.translation_relative()[other]
-        joint = ["-"] * 3
-        if index:
-            found = tables["joints"][index - 1]
-            metres = found["state_unit"] == "metres"
-            state = pair(found["state"], 1000.0 if metres else 1.0, 2)
-            joint = [
-                pair(found["axis_deg"], 1.0, 2),
-                pair(found["pivot_m"], 1000.0, 1),
-                f"{state} {'mm' if metres else 'deg'}",
-            ]
         rows.append(
             [
                 *(category, part["name"], variant, str(seed)),
                 *(number(turn, 1), pair(part["rotation_deg"], 1.0, 2)),
                 *(number(shift, 2), pair(part["translation_relative"], 100.0, 2)),
-                *joint,
+                *joint_cells(tables, index),
             ]
         )
     return rows

@@ -22,6 +22,7 @@ from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.paper import PM_DIAGONAL_M, ROOT_INPUT
 from caper_jax.evaluation.tables.render import Report, Scatter, Table, number
 from caper_jax.evaluation.tables.static import pair
+from caper_jax.geometry import so3
 
 _FRAMES = 1000
 INPUTS = {"root": ("loss.root_input=root",), "whole": ()}
@@ -76,18 +77,12 @@ def run(name: str, options: Options) -> Report:
                     row |= {k: root[k] for k in ("rotation_deg", "translation_relative")}
                     rows.append(_table7_row(key, kind, seed, root))
                 else:
-                    good = ~found.failed
-                    angles = error_angles(found.estimate, found.truth)[good]
-                    axes = axis_errors(found, dataset.category.directions)[good]
-                    whole = np.degrees(_angle(found.estimate, found.truth))[good]
-                    row |= _summary(angles, axes, whole)
-                    cells = [
-                        f"{np.mean(np.abs(c)):.2f} / {np.median(np.abs(c)):.2f}"
-                        for c in (*angles.T, *axes.T, whole)
-                    ]
+                    errors = _rotation_errors(found, dataset.category.directions)
+                    row |= {f"{of}_deg": _mean_median(values) for of, values in errors.items()}
+                    cells = [pair(row[f"{of}_deg"], 1.0, 2) for of in errors]
                     rows.append([key, kind, str(seed), *cells])
                     if seed == 0:
-                        panels[kind] = tuple(angles.T)
+                        panels[kind] = errors["yaw"], errors["pitch"], errors["roll"]
                 result[key][kind].append(row)
         if panels:
             yaw, pitch, roll = (f"{angle} [deg]" for angle in ANGLES)
@@ -168,11 +163,6 @@ def _off(estimate: ArticulatedPose, truth: ArticulatedPose) -> np.ndarray:
     return one.swapaxes(-1, -2) @ other
 
 
-def _angle(estimate: ArticulatedPose, truth: ArticulatedPose) -> np.ndarray:
-    trace = np.trace(_off(estimate, truth), axis1=-2, axis2=-1)
-    return np.arccos(np.clip((trace - 1) / 2, -1, 1))
-
-
 def _table7_row(category: str, kind: str, seed: int, root: dict[str, Any]) -> list[str]:
     turn, shift = ROOT_INPUT[category][kind]
     return [
@@ -182,16 +172,21 @@ def _table7_row(category: str, kind: str, seed: int, root: dict[str, Any]) -> li
     ]
 
 
-def _summary(angles: np.ndarray, axes: np.ndarray, whole: np.ndarray) -> dict[str, Any]:
-    named = dict(zip((*ANGLES, "first_axis", "second_axis"), (*angles.T, *axes.T), strict=True))
-    named["rotation"] = whole
+def _rotation_errors(found: Evaluation, directions: tuple[str, str]) -> dict[str, np.ndarray]:
+    """Degrees [F] by what is off, in the columns of figure 11; of the frames that did not fail."""
+    good = ~found.failed
+    angles = error_angles(found.estimate, found.truth)[good]
+    axes = axis_errors(found, directions)[good]
+    whole = so3.geodesic_distance(found.estimate.rotation[:, 0], found.truth.rotation[:, 0])
     return {
-        f"{name}_deg": {
-            "mean": float(np.abs(values).mean()),
-            "median": float(np.median(np.abs(values))),
-        }
-        for name, values in named.items()
+        **dict(zip((*ANGLES, "first_axis", "second_axis"), (*angles.T, *axes.T), strict=True)),
+        "rotation": np.degrees(np.asarray(whole))[good],
     }
+
+
+def _mean_median(errors: np.ndarray) -> dict[str, float | None]:
+    """Of the amounts, as ``pair`` takes them."""
+    return {"mean": float(np.abs(errors).mean()), "median": float(np.median(np.abs(errors)))}
 
 
 _TEXTS = {

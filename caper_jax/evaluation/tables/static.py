@@ -111,19 +111,23 @@ def spread_rows(category: str, label: str, tables: dict[str, Any]) -> list[list[
             pair(part["iou_size"], 100.0, 1),
             pair(part["iou_full"], 100.0, 1),
         ]
-        if index:
-            joint = tables["joints"][index - 1]
-            metres = joint["state_unit"] == "metres"
-            state = pair(joint["state"], 1000.0 if metres else 1.0, 2)
-            cells += [
-                pair(joint["axis_deg"], 1.0, 2),
-                pair(joint["pivot_m"], 1000.0, 1),
-                f"{state} {'mm' if metres else 'deg'}",
-            ]
-        else:
-            cells += ["-"] * 3
+        cells += joint_cells(tables, index)
         rows.append([category, part["name"], label, *cells])
     return rows
+
+
+def joint_cells(tables: dict[str, Any], part: int) -> list[str]:
+    """Mean / median of the joint that holds a part: axis [deg], pivot [mm], state with its unit."""
+    if part == 0:
+        return ["-"] * 3
+    joint = tables["joints"][part - 1]
+    metres = joint["state_unit"] == "metres"
+    state = pair(joint["state"], 1000.0 if metres else 1.0, 2)
+    return [
+        pair(joint["axis_deg"], 1.0, 2),
+        pair(joint["pivot_m"], 1000.0, 1),
+        f"{state} {'mm' if metres else 'deg'}",
+    ]
 
 
 def pair(summary: dict[str, float | None], factor: float, digits: int) -> str:
