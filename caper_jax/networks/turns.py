@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from caper_jax.networks.canonical import multiply
+
 
 def _rotations() -> np.ndarray:
     """[24, 3, 3] signed permutation matrices of determinant one, the identity first."""
@@ -43,9 +45,9 @@ def turn_between(reference, truth) -> tuple[jax.Array, jax.Array]:
       index: [...] int32 into ``TURNS``, the t for which reference @ TURNS[t] is nearest.
       angle: [...] radians that remain.
     """
-    off = jnp.swapaxes(reference, -1, -2) @ truth
+    off = multiply(jnp.swapaxes(reference, -1, -2), truth)
     # The trace of TURNS[t].T @ off grows as the angle between the two shrinks.
-    traces = jnp.einsum("tij,...ij->...t", TURNS.astype(off.dtype), off)
+    traces = jnp.einsum("tij,...ij->...t", TURNS.astype(off.dtype), off, precision="highest")
     index = traces.argmax(-1).astype(jnp.int32)
     cosine = (traces.max(-1) - 1) / 2
     return index, jnp.arccos(jnp.clip(cosine, -1.0, 1.0))
