@@ -25,6 +25,7 @@ from caper_jax.cli.benchmarks import (
     training,
 )
 from caper_jax.data.synthetic.config import GeneratorConfig
+from caper_jax.training import parallel
 from caper_jax.training import run as runs
 from caper_jax.training.task import Task
 
@@ -188,20 +189,23 @@ def tiny_preset(monkeypatch):
     )
 
 
-def test_steps_of_training(few, tiny_preset, monkeypatch):
-    """Three per call."""
+@pytest.mark.parametrize("count", [1, 3])
+def test_steps_of_training(count, few, tiny_preset, monkeypatch):
+    """Several per call, or one whose batch eight devices share: they sum at least the gradient."""
     variables = {"params": {"shift": np.ones(3, np.float32)}}
     monkeypatch.setattr(Task, "init", lambda task, key: variables)
 
     def loss(task, params, model_state, batch, key, progress):
         """In place of the networks', which compile for half a minute."""
-        assert batch.points.shape == (4, 64, 3)
+        assert batch.points.shape == (8, 64, 3)
         return jnp.mean((batch.points - params["shift"]) ** 2), (model_state, {})
 
     monkeypatch.setattr(Task, "loss", loss)
-    step = training.make("box", "fast", 4, 3)
-    assert step.batch == 4
-    assert [int(step.call()) for _ in range(2)] == [3, 6]
+    mesh = parallel.data_mesh() if count == 1 else None
+    step = training.make("box", "fast", 8, count, mesh)
+    assert step.batch == 8 and step.gradients["shift"].shape == (3,)
+    assert [int(step.call()) for _ in range(2)] == [count, 2 * count]
+    assert (step.reductions > 0) == (mesh is not None)
     assert step.costs.flops and step.megabytes > 0 and step.compile_seconds > 0
 
 

@@ -25,6 +25,7 @@ SUMMARIES = {
     "se3": "exponentials and logarithms of a million twists, beside jaxlie where it is installed",
     "iou": "pairs/s of the exact intersection over union of oriented boxes",
     "start": "seconds of the import and to a first pose, with and without kept programs",
+    "processes": "samples/s of training in two processes against one; or many devices on paper",
     "scaling": "time and memory as points, parts and batch grow",
     "profile": "what takes the time in the estimator and in the tracker",
     "gate": "ratios to plain computations against the committed ones; fails on a loss of a quarter",
@@ -46,6 +47,7 @@ def build_parser() -> argparse.ArgumentParser:
             ("tracker --category laptop", "frames/s of the tracker, beside the estimator"),
             ("generator --category box --set table=0.5", "with table pixels in half the masks"),
             ("profile --plot profile.png", "what takes the time, as a picture"),
+            ("processes --model --preset fast --step-ms 20", "many devices on paper"),
             ("gate", "exit code 1 where a ratio fell by a quarter"),
         ],
     )

@@ -74,6 +74,8 @@ class Step:
       batch: samples per step.
       call: takes the next steps.
       costs: of one step.
+      gradients: shapes of the gradients.
+      reductions: sums over devices in the program.
       megabytes: that the program takes.
       compile_seconds: how long tracing and compiling took.
     """
@@ -81,16 +83,28 @@ class Step:
     batch: int
     call: Callable[[], Any]
     costs: costs.Costs
+    gradients: Any
+    reductions: int
     megabytes: float
     compile_seconds: float
 
 
-def make(category: str, preset: str, batch: int | None = None, count: int = 1) -> Step:
-    """Compiles the step of a preset, with its batch size or another, ``count`` steps per call."""
+def make(
+    category: str, preset: str, batch: int | None = None, count: int = 1, mesh: Any = None
+) -> Step:
+    """Compiles the step of a preset.
+
+    Args:
+      category, preset: of the run.
+      batch: samples per step over all devices; by default the preset's.
+      count: steps per call.
+      mesh: devices that share the batch.
+    """
     import jax
     import numpy as np
 
     from caper_jax.data.synthetic.scene import Generator
+    from caper_jax.training import parallel
     from caper_jax.training import run as training
     from caper_jax.training.state import TrainState, make_step
     from caper_jax.training.task import Task
@@ -103,18 +117,33 @@ def make(category: str, preset: str, batch: int | None = None, count: int = 1) -
     generator = Generator(task_category, data, split="train")
     optimizer = config.training.build_optimizer()
     function: Any = make_step(
-        task.loss, optimizer, batch_fn=lambda key, bank: generator.draw(key, size, bank)
+        task.loss,
+        optimizer,
+        batch_fn=lambda key, bank: generator.draw(key, size, bank),
+        mesh=mesh,
     )
-    state = TrainState.create(task.init(jax.random.key(0)), optimizer, 0)
-    numbers = jax.device_put((np.zeros(count, np.float32), np.ones(count, np.float32)))
+    variables = task.init(jax.random.key(0))
+    gradients = jax.eval_shape(lambda: variables["params"])
+    sharding = parallel.one_device() if mesh is None else parallel.replicated(mesh)
+    state = parallel.place(TrainState.create(variables, optimizer, 0), sharding)
+    numbers = np.zeros(count, np.float32), np.ones(count, np.float32)
+    *numbers, bank = parallel.place((*numbers, generator.bank), sharding)
     began = time.perf_counter()
-    lowered = function.lower(state, *numbers, generator.bank)
+    lowered = function.lower(state, *numbers, bank)
     compiled = lowered.compile()
     seconds = time.perf_counter() - began
 
     def call() -> Any:
         nonlocal state
-        state, _ = compiled(state, *numbers, generator.bank)
+        state, _ = compiled(state, *numbers, bank)
         return state.step
 
-    return Step(size, call, costs.of(lowered, compiled), timing.megabytes(compiled), seconds)
+    return Step(
+        size,
+        call,
+        costs.of(lowered, compiled),
+        gradients,
+        0 if mesh is None else compiled.as_text().count(" all-reduce("),
+        timing.megabytes(compiled),
+        seconds,
+    )
