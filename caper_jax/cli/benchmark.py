@@ -16,14 +16,16 @@ from caper_jax.cli.benchmarks import timing
 
 # Subcommand -> one line for --help; the module of the same name in benchmarks/ holds it.
 SUMMARIES = {
+    "ceilings": "what the device does at most: a copy, and matrix products by precision",
     "estimator": "clouds/s of the single-frame estimator, batch 1 and 32",
     "training": "samples/s of a training step, data generation included, and its memory",
-    "tracker": "one step of the tracker against one single-frame estimate, batch 1",
+    "tracker": "one step of the tracker against one single-frame estimate, or of many at once",
     "generator": "frames/s of the generator per category, with Kinect noise",
     "loader": "what feeding from disk costs a training step of the fast preset",
     "se3": "exponentials and logarithms of a million twists, beside jaxlie where it is installed",
     "iou": "pairs/s of the exact intersection over union of oriented boxes",
     "start": "seconds of the import and to a first pose, with and without kept programs",
+    "processes": "samples/s of training in two processes against one; or many devices on paper",
     "scaling": "time and memory as points, parts and batch grow",
     "profile": "what takes the time in the estimator and in the tracker",
     "gate": "ratios to plain computations against the committed ones; fails on a loss of a quarter",
@@ -38,12 +40,14 @@ def build_parser() -> argparse.ArgumentParser:
         [
             ("estimator --category box --category laptop", "clouds/s, points to poses"),
             ("estimator --preset paper", "the published sizes beside their naive formulation"),
+            ("tracker --videos 256 --keep-programs", "many videos at once; compiles once"),
             ("generator", "frames/s of the generator, all categories"),
             ("generator --category box --json speed.json", "one category, kept in a file"),
             ("loader --category box --data box.h5", "feeding from disk against memory"),
             ("tracker --category laptop", "frames/s of the tracker, beside the estimator"),
             ("generator --category box --set table=0.5", "with table pixels in half the masks"),
             ("profile --plot profile.png", "what takes the time, as a picture"),
+            ("processes --model --preset fast --step-ms 20", "many devices on paper"),
             ("gate", "exit code 1 where a ratio fell by a quarter"),
         ],
     )
@@ -53,6 +57,12 @@ def build_parser() -> argparse.ArgumentParser:
         _module(name).add_arguments(command)
         command.add_argument(
             "--json", type=Path, metavar="FILE", help="write machine and rows there too"
+        )
+        command.add_argument(
+            "--keep-programs",
+            action="store_true",
+            help="use and keep compiled programs, as other commands do; without times of "
+            "compilation",
         )
     return parser
 
@@ -65,11 +75,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = build_parser().parse_args(argv)
     if arguments.json is not None:
         common.check_folder(arguments.json.parent, "--json")
-    _compile_anew()
-    facts = machine()
+    if not arguments.keep_programs:
+        _compile_anew()
+    facts = {**machine(), "programs": "kept" if arguments.keep_programs else "new"}
     rows: list[dict[str, Any]] = []
     module = _module(arguments.benchmark)
     for row in module.run(arguments):
+        if arguments.keep_programs and "compile_s" in row:
+            row["compile_s"] = "-"  # where programs are found it says nothing
         if not rows:
             print(", ".join(f"{name} {value}" for name, value in facts.items()))
             print("  ".join(f"{name:>14}" for name in row))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from caper_jax.cli import common
-from caper_jax.cli.benchmarks import timing
+from caper_jax.cli.benchmarks import costs, timing
 
 # Clouds per second to reach on two CPU cores, by preset and batch.
 TARGETS = {("fast", 1): 100, ("fast", 32): 200, ("paper", 1): 12}
@@ -34,7 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """From points [B, 1024, 3] in memory to poses there, beside a matrix product."""
+    """From points to poses on the device, beside a matrix product.
+
+    One cloud comes from the host, as from a camera; those of a larger batch are on the device.
+    """
     from caper_jax import categories
 
     for name in arguments.category or (
@@ -47,11 +50,13 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
             yield {
                 "category": name,
                 "batch": batch,
+                "points_on": "host" if batch == 1 else "device",
                 "clouds_per_s": round(rate, 1),
                 "target": TARGETS.get((arguments.preset, batch), "-"),
                 "ms": round(1000 * found["seconds"], 2),
                 "in_matmuls": round(found["seconds"] / found["matmul"], 2),
                 **found["more"],
+                **costs.columns(found["costs"], found["seconds"]),
                 "load_average": timing.load_average(),
             }
 
@@ -62,9 +67,22 @@ def _fast(name: str, batch: int, repeats: int) -> dict[str, Any]:
 
     estimator = load(name)
     points = clouds(estimator.category, batch)
-    calls = {"ours": lambda: estimator(points), "matmul": timing.matmul()}
-    medians = timing.interleaved(calls, repeats)
-    return {"seconds": medians["ours"], "matmul": medians["matmul"], "more": {}}
+    call, cost = _call(estimator, points)
+    medians = timing.interleaved({"ours": call, "matmul": timing.matmul()}, repeats)
+    return {"seconds": medians["ours"], "matmul": medians["matmul"], "costs": cost, "more": {}}
+
+
+def _call(estimator: Any, points: Any) -> tuple[Callable[[], Any], costs.Costs]:
+    """An estimate of clouds [B, N, 3], and what it costs; the program is compiled here."""
+    import jax
+
+    lowered = jax.jit(estimator.function).lower(estimator.variables, points)
+    compiled = lowered.compile()
+    cost = costs.of(lowered, compiled)
+    if len(points) == 1:
+        return lambda: compiled(estimator.variables, estimator._sampled(points)), cost
+    resident = jax.device_put(points)
+    return lambda: compiled(estimator.variables, resident), cost
 
 
 def _paper(name: str, batch: int, repeats: int) -> dict[str, Any]:
@@ -81,11 +99,12 @@ def _paper(name: str, batch: int, repeats: int) -> dict[str, Any]:
     estimator = random_estimator(category, network)
     reference = random_estimator(category, network)
     points = clouds(category, batch)
+    ours, cost = _call(estimator, points)
     with naive.formulation():
-        reference(points)  # traced and compiled here
+        others_call, _ = _call(reference, points)
     calls = {
-        "ours": lambda: estimator(points),
-        "naive": lambda: reference(points),
+        "ours": ours,
+        "naive": others_call,
         "matmul": timing.matmul(),
     }
     medians = timing.interleaved(calls, repeats)
@@ -97,15 +116,16 @@ def _paper(name: str, batch: int, repeats: int) -> dict[str, Any]:
         module = RootNetwork(network)
         return jax.jit(lambda x: module.apply(own, x, train=False))(points * category.unit)
 
-    ours = jax.tree.leaves(outputs())
+    found = jax.tree.leaves(outputs())
     with naive.formulation():
         others = jax.tree.leaves(outputs())
     off = max(
-        float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(ours, others, strict=True)
+        float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(found, others, strict=True)
     )
     return {
         "seconds": medians["ours"],
         "matmul": medians["matmul"],
+        "costs": cost,
         "more": {
             "naive_ms": round(1000 * medians["naive"], 1),
             "naive/ours": round(medians["naive"] / medians["ours"], 1),

@@ -143,7 +143,7 @@ def measured() -> dict[str, tuple[Callable[[], Any], Callable[[], Any]]]:
         "estimator, batch 1": (lambda: estimator(points[0]), matmul),
         f"estimator, batch {_BATCH}": (lambda: estimator(points), matmul),
         "tracker, one step": (lambda: tracker(np.asarray(points[0])), matmul),
-        "fast, training step": (training.step("laptop", "fast", None)[1], matmul),
+        "fast, training step": (training.make("laptop", "fast").call, matmul),
         "HS-Encoder with gradient": (fast_encoder, naive_encoder),
         "se(3) exp": (lambda: functions["exp"](twists), sines),
         "se(3) log": (lambda: functions["log"](transforms), sines),

@@ -28,7 +28,7 @@ def clouds(category: Category, batch: int, num_points: int = 1024) -> np.ndarray
     from caper_jax.data.synthetic.config import GeneratorConfig
     from caper_jax.data.synthetic.scene import Generator
 
-    config = GeneratorConfig(instances=batch, noise=("kinect",), num_points=num_points)
+    config = GeneratorConfig(instances=min(batch, 200), noise=("kinect",), num_points=num_points)
     generator = Generator(category, config, split="test")
     return np.asarray(generator.batch(jax.random.key(0), batch).points)
 

@@ -1,4 +1,4 @@
-"""``caper benchmark tracker``: one step of the tracker against one single-frame estimate."""
+"""``caper benchmark tracker``: one step of the tracker against one estimate, or of many at once."""
 
 from __future__ import annotations
 
@@ -10,13 +10,21 @@ from pathlib import Path
 from typing import Any
 
 from caper_jax.cli import common
+from caper_jax.cli.benchmarks import costs, timing
 
-_VIDEOS = 2  # that the frames come from
+_VIDEOS = 2  # that the frames come from, one video at a time
+_DISTINCT = 4  # of many at once; the rest repeats them
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--category", action="append", help="may be repeated (default: laptop)")
     parser.add_argument("--weights", type=Path, help="model directory (default: the package's)")
+    parser.add_argument(
+        "--videos",
+        type=common.positive_int,
+        default=1,
+        help="tracked at once, by one program on the device (default: %(default)s)",
+    )
     parser.add_argument(
         "--repeats",
         type=common.positive_int,
@@ -26,25 +34,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Both on the same frames in turn, batch 1, from points [1024, 3] to poses on the host."""
+    """One video: both on the same frames in turn, from points [1024, 3] to poses on the host.
+
+    Many: the step alone, vmapped, from points on the device to poses there. No video may ask the
+    estimator alone then: all are estimated in every frame, and the answer kept where it is due.
+    """
     for name in arguments.category or ["laptop"]:
-        yield _measure(name, arguments.weights, arguments.repeats)
+        if arguments.videos == 1:
+            yield _measure(name, arguments.weights, arguments.repeats)
+        else:
+            yield _measure_many(name, arguments.weights, arguments.videos, arguments.repeats)
 
 
 def _measure(name: str, weights: Path | None, repeats: int) -> dict[str, Any]:
     import jax
-    import numpy as np
 
-    from caper_jax.data.synthetic.config import GeneratorConfig
-    from caper_jax.data.synthetic.videos import FRAMES, VideoGenerator
+    from caper_jax.data.synthetic.videos import FRAMES
     from caper_jax.estimator import load
     from caper_jax.tracker import Tracker, config_for
 
     estimator = load(name, weights)
     tracker = Tracker(estimator, config_for(estimator))
-    config = GeneratorConfig(instances=_VIDEOS, noise=("kinect",))
-    videos = VideoGenerator(estimator.category, config, split="test")
-    batch = jax.tree.map(np.asarray, videos.batch(jax.random.key(0), _VIDEOS))
+    batch = _videos(estimator.category, _VIDEOS)
 
     def timed(function: Callable[[Any], Any], points: Any) -> tuple[float, Any]:
         began = time.perf_counter()
@@ -59,6 +70,11 @@ def _measure(name: str, weights: Path | None, repeats: int) -> dict[str, Any]:
     begin(0)
     timed(tracker, batch.points[0, 1])
     compiling = time.perf_counter() - began
+    # The program that just ran, which is not compiled again.
+    lowered = tracker.step.lower(
+        estimator.variables, tracker.state, tracker.observe(batch.points[0, 1])
+    )
+    cost = costs.of(lowered, lowered.compile())
     timed(estimator, batch.points[0, 1])
     steps: list[float] = []
     keyframes: list[float] = []
@@ -81,4 +97,72 @@ def _measure(name: str, weights: Path | None, repeats: int) -> dict[str, Any]:
         "estimate_ms": round(1000 * estimate, 2),
         "step/estimate": round(step / estimate, 2),
         "compile_s": round(compiling, 1),
+        **costs.columns(cost, step),
+        "load_average": timing.load_average(),
     }
+
+
+def _videos(category: Any, count: int) -> Any:
+    """Generated videos, on the host."""
+    import jax
+    import numpy as np
+
+    from caper_jax.data.synthetic.config import GeneratorConfig
+    from caper_jax.data.synthetic.videos import VideoGenerator
+
+    config = GeneratorConfig(instances=count, noise=("kinect",))
+    videos = VideoGenerator(category, config, split="test")
+    return jax.tree.map(np.asarray, videos.batch(jax.random.key(0), count))
+
+
+def _measure_many(name: str, weights: Path | None, count: int, repeats: int) -> dict[str, Any]:
+    import jax
+    import numpy as np
+
+    from caper_jax.estimator import load
+    from caper_jax.tracker import Tracker, config_for
+
+    estimator = load(name, weights)
+    tracker = Tracker(estimator, config_for(estimator))
+    distinct = _videos(estimator.category, min(count, _DISTINCT)).points
+    clouds = distinct[np.arange(count) % len(distinct)].swapaxes(0, 1)
+    frames = [jax.device_put(several(points)) for points in clouds]
+    begin = jax.tree.map(
+        lambda leaf: np.repeat(np.asarray(leaf)[None], count, 0), tracker.initial_state()
+    )
+
+    began = time.perf_counter()
+    # Old states make room for new ones.
+    step = jax.jit(jax.vmap(tracker.function, in_axes=(None, 0, 0)), donate_argnums=1)
+    lowered = step.lower(estimator.variables, begin, frames[0])
+    compiled = lowered.compile()
+    compiling = time.perf_counter() - began
+    seconds: list[float] = []
+    for _ in range(repeats):
+        state = jax.device_put(begin)
+        for frame in frames:
+            jax.block_until_ready(state)
+            began = time.perf_counter()
+            state, result = jax.block_until_ready(compiled(estimator.variables, state, frame))
+            seconds.append(time.perf_counter() - began)
+    median = statistics.median(seconds)
+    return {
+        "category": estimator.category.name,
+        "videos": count,
+        "frames_per_s": round(count / median, 1),
+        "step_ms": round(1000 * median, 2),
+        "lost_%": round(100 * float(np.mean(result.lost)), 1),
+        "compile_s": round(compiling, 1),
+        "memory_MB": round(timing.megabytes(compiled)),
+        **costs.columns(costs.of(lowered, compiled), median),
+        "load_average": timing.load_average(),
+    }
+
+
+def several(points: Any) -> Any:
+    """The frames [V, N, 3] that many videos show at one moment, as observations."""
+    import numpy as np
+
+    from caper_jax.tracking.state import Observation
+
+    return Observation(points, np.ones(len(points), bool), np.full(points.shape[:2], -1, np.int32))

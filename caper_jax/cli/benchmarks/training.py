@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 from caper_jax.cli import common
-from caper_jax.cli.benchmarks import timing
+from caper_jax.cli.benchmarks import costs, timing
 
 # Samples per second to reach on two CPU cores: fast per stage, paper with its best batch.
 TARGETS = {"fast": 150, "paper": 5}
@@ -23,7 +25,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="samples per step, may be repeated (default: the preset's; of paper 2, 4 and 16)",
     )
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=10, help="steps (default: %(default)s)"
+        "--steps-per-dispatch",
+        type=common.positive_int,
+        default=1,
+        metavar="N",
+        help="steps compiled into one call, to hide the cost of calling (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--repeats", type=common.positive_int, default=10, help="calls (default: %(default)s)"
     )
 
 
@@ -34,31 +43,68 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     with one stage each would do.
     """
     default = (None,) if arguments.preset == "fast" else (2, 4, 16)
+    count = arguments.steps_per_dispatch
     for batch in arguments.batch or default:
-        batch, call, compiled = step(arguments.category, arguments.preset, batch)
-        calls = {"ours": call, "matmul": timing.matmul()}
+        step = make(arguments.category, arguments.preset, batch, count)
+        calls = {"ours": step.call, "matmul": timing.matmul()}
         medians = timing.interleaved(calls, arguments.repeats)
+        seconds = medians["ours"] / count
         yield {
             "preset": arguments.preset,
-            "batch": batch,
-            "samples_per_s": round(batch / medians["ours"], 1),
-            "samples_per_stage": round(2 * batch / medians["ours"], 1),
+            "batch": step.batch,
+            "steps/call": count,
+            "samples_per_s": round(step.batch / seconds, 1),
+            "samples_per_stage": round(2 * step.batch / seconds, 1),
             "target": TARGETS[arguments.preset],
-            "step_ms": round(1000 * medians["ours"], 1),
-            "in_matmuls": round(medians["ours"] / medians["matmul"], 1),
-            "memory_MB": round(timing.megabytes(compiled)),
+            "step_ms": round(1000 * seconds, 2),
+            "in_matmuls": round(seconds / medians["matmul"], 1),
+            "memory_MB": round(step.megabytes),
+            "compile_s": round(step.compile_seconds, 1),
+            # Of several steps in a loop the compiler counts one.
+            **costs.columns(step.costs, seconds),
             "load_average": timing.load_average(),
         }
 
 
-def step(category: str, preset: str, batch: int | None) -> tuple[int, Callable[[], Any], Any]:
-    """A training run's step: (batch size, a call that takes the next one, the program)."""
-    import dataclasses
+@dataclass(frozen=True)
+class Step:
+    """A training run's step.
 
+    Attributes:
+      batch: samples per step.
+      call: takes the next steps.
+      costs: of one step.
+      gradients: shapes of the gradients.
+      reductions: sums over devices in the program.
+      megabytes: that the program takes.
+      compile_seconds: how long tracing and compiling took.
+    """
+
+    batch: int
+    call: Callable[[], Any]
+    costs: costs.Costs
+    gradients: Any
+    reductions: int
+    megabytes: float
+    compile_seconds: float
+
+
+def make(
+    category: str, preset: str, batch: int | None = None, count: int = 1, mesh: Any = None
+) -> Step:
+    """Compiles the step of a preset.
+
+    Args:
+      category, preset: of the run.
+      batch: samples per step over all devices; by default the preset's.
+      count: steps per call.
+      mesh: devices that share the batch.
+    """
     import jax
     import numpy as np
 
     from caper_jax.data.synthetic.scene import Generator
+    from caper_jax.training import parallel
     from caper_jax.training import run as training
     from caper_jax.training.state import TrainState, make_step
     from caper_jax.training.task import Task
@@ -67,19 +113,37 @@ def step(category: str, preset: str, batch: int | None) -> tuple[int, Callable[[
     size = batch or config.training.batch_size
     task_category = training.categories.get(category)
     task = Task(task_category, config.network, config.loss)
-    data = dataclasses.replace(config.data, instances=200)
+    data = replace(config.data, instances=200)
     generator = Generator(task_category, data, split="train")
     optimizer = config.training.build_optimizer()
     function: Any = make_step(
-        task.loss, optimizer, batch_fn=lambda key, bank: generator.draw(key, size, bank)
+        task.loss,
+        optimizer,
+        batch_fn=lambda key, bank: generator.draw(key, size, bank),
+        mesh=mesh,
     )
-    state = TrainState.create(task.init(jax.random.key(0)), optimizer, 0)
-    numbers = np.zeros(1, np.float32), np.ones(1, np.float32)
-    compiled = function.lower(state, *numbers, generator.bank).compile()
+    variables = task.init(jax.random.key(0))
+    gradients = jax.eval_shape(lambda: variables["params"])
+    sharding = parallel.one_device() if mesh is None else parallel.replicated(mesh)
+    state = parallel.place(TrainState.create(variables, optimizer, 0), sharding)
+    numbers = np.zeros(count, np.float32), np.ones(count, np.float32)
+    *numbers, bank = parallel.place((*numbers, generator.bank), sharding)
+    began = time.perf_counter()
+    lowered = function.lower(state, *numbers, bank)
+    compiled = lowered.compile()
+    seconds = time.perf_counter() - began
 
     def call() -> Any:
         nonlocal state
-        state, _ = compiled(state, *numbers, generator.bank)
+        state, _ = compiled(state, *numbers, bank)
         return state.step
 
-    return size, call, compiled
+    return Step(
+        size,
+        call,
+        costs.of(lowered, compiled),
+        gradients,
+        0 if mesh is None else compiled.as_text().count(" all-reduce("),
+        timing.megabytes(compiled),
+        seconds,
+    )
