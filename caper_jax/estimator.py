@@ -18,7 +18,7 @@ from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.confidence import Calibration
 from caper_jax.configuration import from_dict
-from caper_jax.data.cloud import MIN_POINTS, sample_points
+from caper_jax.data.cloud import MIN_POINTS, are_sampled, sample_points
 from caper_jax.errors import CaperError
 from caper_jax.geometry import se3
 from caper_jax.geometry.directions import rotation_from_directions
@@ -238,6 +238,8 @@ class Estimator:
         count = self.network.num_points
         if clouds.ndim == 2:
             return sample_points(clouds, count).points[None]
+        if are_sampled(clouds, count):
+            return clouds.astype(np.float32)
         names = [f"points[{i}]" if len(clouds) > 1 else "points" for i in range(len(clouds))]
         return np.stack(
             [

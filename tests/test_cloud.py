@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from caper_jax.data.cloud import (
+    are_sampled,
     cloud_from_depth,
     read_points,
     sample_points,
@@ -137,6 +138,23 @@ def test_raw_clouds_are_checked():
             sample_points(bad, where="cloud.npy")
     with pytest.raises(CaperError, match="radius must be positive"):
         sample_points(points, radius=0)
+
+
+def test_only_clouds_that_sampling_would_return_count_as_sampled():
+    clouds = np.random.default_rng(0).normal(size=(3, 50, 3)) * 0.1 + [0, 0, 1]
+    assert are_sampled(clouds, 50)
+    for cloud in clouds:
+        np.testing.assert_array_equal(sample_points(cloud, 50).points, cloud.astype(np.float32))
+    assert not are_sampled(clouds, 49)
+    assert not are_sampled(clouds.astype(str), 50)
+    for spoil in (np.nan, np.inf, 0.0):
+        spoilt = clouds.copy()
+        spoilt[1, 7] = spoil
+        assert not are_sampled(spoilt, 50)
+    for factor in (1000.0, -1.0):
+        spoilt = clouds.copy()
+        spoilt[2] *= factor
+        assert not are_sampled(spoilt, 50)
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])

@@ -204,6 +204,20 @@ def sample_points(
     )
 
 
+def are_sampled(clouds: np.ndarray, num_points: int) -> bool:
+    """Whether ``sample_points`` would return each of these clouds [B, N, 3] as it is.
+
+    Asked of all at once, which for many clouds is several times as fast as sampling each.
+    """
+    if clouds.shape[1] != num_points or clouds.dtype.kind not in "fiu":
+        return False
+    cast = clouds.astype(np.float32)
+    if not (np.isfinite(cast).all() and (cast != 0).any(-1).all()):
+        return False
+    depth = np.median(cast[..., 2], axis=1)
+    return bool(((depth > 0) & (depth <= _FARTHEST_M)).all())
+
+
 def _near(points: np.ndarray, radius: float) -> np.ndarray:
     """Rows within ``radius`` of the median point, which a minority of outliers cannot move."""
     if not radius > 0:
