@@ -30,7 +30,12 @@ from caper_jax.networks.canonical import (
     transpose,
     view_rotation,
 )
-from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
+from caper_jax.networks.caper import (
+    NetworkConfig,
+    PartsNetwork,
+    RootNetwork,
+    shared_neighbourhoods,
+)
 from caper_jax.networks.increment import increment_transform
 from caper_jax.networks.turns import chosen_turn
 from caper_jax.networks.voting import vote
@@ -96,11 +101,12 @@ def estimate(
 
     def apply(stage, module, cloud):
         own = {name: collection[stage] for name, collection in variables.items()}
-        return module.apply(own, cloud, train=False)
+        return module.apply(own, cloud, train=False, space=space)
 
     unit = category.unit
     view = view_rotation(points)
     cloud = rotate(view, points) * unit
+    space = shared_neighbourhoods(network, cloud)
     root = apply("root", RootNetwork(network), cloud)
     rotation, degenerate = rotation_from_directions(
         root.directions[:, 0],

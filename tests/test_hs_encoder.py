@@ -13,7 +13,7 @@ from tiny import HS, random_like
 
 from caper_jax import categories
 from caper_jax.networks.caper import PartsNetwork, RootNetwork
-from caper_jax.networks.hs_encoder import HSEncoder, HSEncoderConfig
+from caper_jax.networks.hs_encoder import HSEncoder, HSEncoderConfig, neighbourhoods
 from caper_jax.networks.presets import preset
 
 
@@ -200,3 +200,20 @@ def test_parameter_count_of_the_paper_preset():
         assert sum(math.prod(leaf.shape) for leaf in leaves) == expected
     assert 9e6 < root < 10e6
     assert 13e6 < parts < 14e6
+
+
+def test_neighbourhoods_serve_every_pose_of_the_cloud():
+    cloud = np.random.default_rng(1).normal(size=(2, 64, 3)).astype(np.float32)
+    turn = np.float32([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])
+    space = jax.jit(lambda x: neighbourhoods(x, HS))(cloud)
+    moved = jax.jit(lambda x: neighbourhoods(x, HS))(cloud @ turn + 2.0)
+    jax.tree.map(np.testing.assert_array_equal, space, moved)
+    assert [a.shape for a in space.around] == [(2, 64, 4), (2, 16, 2), (2, 4, 1)]
+    module = HSEncoder(HS)
+    apply = jax.jit(lambda v, x, space: module.apply(v, x, False, space))
+    variables = random_like(shapes_of(module, 64))
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        apply(variables, cloud, space),
+        apply(variables, cloud, None),
+    )

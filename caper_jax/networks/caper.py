@@ -12,7 +12,12 @@ import jax.numpy as jnp
 
 from caper_jax.networks.fast_encoder import FastEncoder, FastEncoderConfig
 from caper_jax.networks.heads import HeadConfig, PointHead, PooledHead, unit_vectors
-from caper_jax.networks.hs_encoder import HSEncoder, HSEncoderConfig
+from caper_jax.networks.hs_encoder import (
+    HSEncoder,
+    HSEncoderConfig,
+    Neighbourhoods,
+    neighbourhoods,
+)
 from caper_jax.networks.turns import NUM_TURNS
 
 IncrementKind = Literal["lie", "euclidean"]
@@ -72,6 +77,26 @@ def make_encoder(config: NetworkConfig) -> nn.Module:
     return FastEncoder(config.fast, name="encoder")
 
 
+def shared_neighbourhoods(config: NetworkConfig, points) -> Neighbourhoods | None:
+    """What both stages may use in evaluation: neighbours do not change with the pose.
+
+    Args:
+      config: sizes.
+      points: [B, N, 3] the cloud, in any pose, network units.
+
+    Returns:
+      None for an encoder that searches no neighbours.
+    """
+    if config.encoder != "hs":
+        return None
+    return neighbourhoods(points - points.mean(axis=1, keepdims=True), config.hs)
+
+
+def _encode(config: NetworkConfig, points, train: bool, space: Neighbourhoods | None):
+    encoder = make_encoder(config)
+    return encoder(points, train) if space is None else encoder(points, train, space)
+
+
 @flax.struct.dataclass
 class RootOutput:
     """Stage I, in the frame and units of its input cloud.
@@ -93,10 +118,10 @@ class RootNetwork(nn.Module):
     config: NetworkConfig
 
     @nn.compact
-    def __call__(self, points, train: bool) -> RootOutput:
-        """points [B, N, 3], network units -> RootOutput."""
+    def __call__(self, points, train: bool, space: Neighbourhoods | None = None) -> RootOutput:
+        """points [B, N, 3], network units -> RootOutput; see ``shared_neighbourhoods``."""
         mean = points.mean(axis=1, keepdims=True)
-        features = make_encoder(self.config)(points - mean, train)
+        features = _encode(self.config, points - mean, train, space)
         heads = self.config.root_heads
         residual = PooledHead(3, heads, with_points=True, name="translation")(features, train)
         if self.config.rotation == "quaternion":
@@ -168,15 +193,16 @@ class PartsNetwork(nn.Module):
     num_parts: int
 
     @nn.compact
-    def __call__(self, points, train: bool) -> PartsOutput:
+    def __call__(self, points, train: bool, space: Neighbourhoods | None = None) -> PartsOutput:
         """points [B, N, 3], canonicalised, network units -> PartsOutput.
 
-        In training N is divided by ``config.point_stride`` in the point-wise outputs.
+        In training N is divided by ``config.point_stride`` in the point-wise outputs. See
+        ``shared_neighbourhoods`` for the last argument.
         """
         parts, joints = self.num_parts, self.num_parts - 1
         batch = points.shape[0]
         # Not centred: where the origin lies is what stage I has found out.
-        features = make_encoder(self.config)(points, train)
+        features = _encode(self.config, points, train, space)
         chosen = features.every(self.config.point_stride) if train else features
         pointwise = self.config.point_heads
         segmentation = PointHead(parts, pointwise, name="segmentation")(chosen, train)

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from caper_jax.networks.selection import first_smallest, smallest_k
+
 BLOCK_ABOVE = 4096  # points, beyond which distances are not held all at once
 _BLOCK = 512  # queries whose distances are
 
@@ -39,18 +41,17 @@ def nearest(query, points, k: int, exclude_self: bool = False):
 
     def choose(distance, first):
         if exclude_self:
-            # Masking the diagonal, not top_k(k + 1)[1:]: the slice turns top_k into a full sort.
             own = first + jnp.arange(distance.shape[1])
             itself = own[:, None] == jnp.arange(distance.shape[2])
             distance = jnp.where(itself, jnp.inf, distance)
-        return lax.top_k(-distance, k)[1]
+        return smallest_k(distance, k)
 
     return _by_distance(choose, query, points)
 
 
 def nearest_row(query, points):
     """Index [B, N] of the nearest of ``points`` [B, M, C] to each ``query`` [B, N, C]."""
-    return _by_distance(lambda distance, _: distance.argmin(-1), query, points)
+    return _by_distance(lambda distance, _: first_smallest(distance), query, points)
 
 
 def _by_distance(choose, query, points):

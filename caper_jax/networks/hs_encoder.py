@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import flax.linen as nn
+import flax.struct
 import jax
 import jax.numpy as jnp
 
@@ -112,6 +113,52 @@ class HSLayer(Weights, nn.Module):
         return OutlierRobust(name="robust")(center + active, around) + skip
 
 
+@flax.struct.dataclass
+class Neighbourhoods:
+    """Which points are near which in space; a rigid motion of the cloud does not change it.
+
+    Attributes:
+      around: per resolution, [B, N, k] the neighbours of each point, nearest first.
+      kept: per pooling, [B, N / 4] the rows that it keeps.
+      upsample: per pooling, [B, N] the row it kept that is nearest to each input point.
+    """
+
+    around: tuple[Any, ...]
+    kept: tuple[Any, ...]
+    upsample: tuple[Any, ...]
+
+
+def neighbourhoods(points, config: HSEncoderConfig, keys=(None, None)) -> Neighbourhoods:
+    """The neighbourhoods of points [B, N, 3] at N, N/4 and N/16 of them.
+
+    Args:
+      points: the cloud.
+      config: sizes of the encoder.
+      keys: per pooling, draws the subset that is kept, per cloud; None: every fourth point.
+    """
+
+    def neighbours(cloud):
+        k = max(1, min(config.neighbours, cloud.shape[1] // 8))
+        return nearest(cloud, cloud, k, exclude_self=True)
+
+    around, kept, upsample = [neighbours(points)], [], []
+    cloud = points
+    for key in keys:
+        batch, count = cloud.shape[:2]
+        left = count // config.pooling
+        if key is None:
+            rows = jnp.broadcast_to(jnp.arange(left) * config.pooling, (batch, left))
+        else:
+            rows = jax.vmap(lambda key, n=count, m=left: jax.random.permutation(key, n)[:m])(
+                jax.random.split(key, batch)
+            )
+        cloud = gather(cloud, rows)
+        around.append(neighbours(cloud))
+        kept.append(rows)
+        upsample.append(nearest_row(points, cloud))
+    return Neighbourhoods(tuple(around), tuple(kept), tuple(upsample))
+
+
 class HSEncoder(nn.Module):
     """Surface layer and four HS layers with two poolings (architecture of HS-Pose).
 
@@ -122,11 +169,11 @@ class HSEncoder(nn.Module):
     config: HSEncoderConfig = HSEncoderConfig()
 
     @nn.compact
-    def __call__(self, points, train: bool) -> Features:
+    def __call__(self, points, train: bool, space: Neighbourhoods | None = None) -> Features:
         """points [B, N, 3], centred, network units -> Features at N, N/4 and N/16 points.
 
         In training the pooled subset is drawn from the rng stream "sample", per cloud; in
-        evaluation it is every fourth point.
+        evaluation it is every fourth point. ``space`` saves finding the neighbours again.
         """
         config = self.config
         layer = [
@@ -138,45 +185,35 @@ class HSEncoder(nn.Module):
             norm = BatchNorm(use_running_average=not train, momentum=0.9, name=f"norm{number}")
             return nn.relu(norm(features))
 
-        def scope(features, around, k):
+        def scope(features, around):
             if not config.feature_space:
                 return around
-            return nearest(features, features, k, exclude_self=True)
+            return nearest(features, features, around.shape[-1], exclude_self=True)
 
-        k0 = self._neighbours(points.shape[1])
-        around0 = nearest(points, points, k0, exclude_self=True)
+        def pool(features, around, kept):
+            """Maximum over the four nearest neighbours, at the points that are kept."""
+            return neighbour_max(features, gather(around[..., :4], kept))
+
+        if space is None:
+            keys = [self.make_rng("sample") if train else None for _ in range(2)]
+            space = neighbourhoods(points, config, keys)
+        around0, around1, around2 = space.around
+        points1 = gather(points, space.kept[0])
+        points2 = gather(points1, space.kept[1])
+
         f0 = nn.relu(layer[0](points, None, around0, around0))
-        f1 = normalise(layer[1](points, f0, scope(f0, around0, k0), around0), 1)
+        f1 = normalise(layer[1](points, f0, scope(f0, around0), around0), 1)
 
-        points1, f1_pooled = self._pool(points, f1, around0, train)
-        k1 = self._neighbours(points1.shape[1])
-        around1 = nearest(points1, points1, k1, exclude_self=True)
-        f2 = normalise(layer[2](points1, f1_pooled, scope(f1_pooled, around1, k1), around1), 2)
-        f3 = normalise(layer[3](points1, f2, scope(f2, around1, k1), around1), 3)
+        f1_pooled = pool(f1, around0, space.kept[0])
+        f2 = normalise(layer[2](points1, f1_pooled, scope(f1_pooled, around1), around1), 2)
+        f3 = normalise(layer[3](points1, f2, scope(f2, around1), around1), 3)
 
-        points2, f3_pooled = self._pool(points1, f3, around1, train)
-        k2 = self._neighbours(points2.shape[1])
-        around2 = nearest(points2, points2, k2, exclude_self=True)
-        f4 = layer[4](points2, f3_pooled, scope(f3_pooled, around2, k2), around2)
+        f3_pooled = pool(f3, around1, space.kept[1])
+        f4 = layer[4](points2, f3_pooled, scope(f3_pooled, around2), around2)
 
         levels = (
             Level(jnp.concatenate([f0, f1], -1)),
-            Level(jnp.concatenate([f2, f3], -1), nearest_row(points, points1)),
-            Level(f4, nearest_row(points, points2)),
+            Level(jnp.concatenate([f2, f3], -1), space.upsample[0]),
+            Level(f4, space.upsample[1]),
         )
         return Features(points, levels, f4.max(1) if config.global_feature else None)
-
-    def _neighbours(self, count: int) -> int:
-        return max(1, min(self.config.neighbours, count // 8))
-
-    def _pool(self, points, features, around, train: bool):
-        """Maximum over the four nearest neighbours, on a quarter of the points."""
-        batch, count = points.shape[:2]
-        kept = count // self.config.pooling
-        if train:
-            keys = jax.random.split(self.make_rng("sample"), batch)
-            chosen = jax.vmap(lambda key: jax.random.permutation(key, count)[:kept])(keys)
-        else:
-            chosen = jnp.broadcast_to(jnp.arange(kept) * self.config.pooling, (batch, kept))
-        pooled = neighbour_max(features, gather(around[..., :4], chosen))
-        return gather(points, chosen), pooled

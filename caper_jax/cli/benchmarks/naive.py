@@ -44,7 +44,8 @@ def neighbour_max(features, index):
 class Encoder(hs_encoder.HSEncoder):
     """The encoder with all its features at every point."""
 
-    def __call__(self, points, train: bool) -> Features:
+    def __call__(self, points, train: bool, space: Any = None) -> Features:
+        del space  # found anew by each network
         features = super().__call__(points, train)
         levels = tuple(Level(level.at_points(level.features)) for level in features.levels)
         return Features(features.points, levels, features.shared)
