@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import tomllib
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import pytest
 
 from caper_jax import configuration
 from caper_jax.errors import CaperError
+from caper_jax.training import run as runs
 from caper_jax.training.loop import TrainingConfig
 
 
@@ -156,3 +158,14 @@ def test_none_where_the_default_is_not_none_cannot_be_written():
     assert tomllib.loads(configuration.to_toml(Bounded())) == {"limit": 1.0}
     with pytest.raises(CaperError, match="limit is None"):
         configuration.to_toml(Bounded(None))
+
+
+CONFIGS = sorted((Path(__file__).resolve().parents[1] / "configs").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_the_configurations_that_ship_can_be_used(path):
+    """Those of the presets say what the presets are."""
+    is_preset = path.stem in ("fast", "paper")
+    preset = runs.preset(path.stem if is_preset else "fast", "box")
+    assert (configuration.update(preset, path) == preset) == is_preset
