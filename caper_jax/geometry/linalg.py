@@ -7,10 +7,10 @@ round its float32 operands to TF32.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from caper_jax.errors import CaperError
@@ -33,33 +33,82 @@ def as_floating(value: ArrayLike, shape: Sequence[int], name: str) -> jax.Array:
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
     """Inner product [...] of vectors [..., D], for small D."""
-    a, b = entries(a, 1), entries(b, 1)
-    terms = [a[i] * b[i] for i in range(len(a))]
-    return sum(terms[1:], start=terms[0])
-
-
-def entries(array: jax.Array, axes: int) -> jax.Array:
-    """The last axes first, so that array[i], or array[i, j], is one entry of all elements.
-
-    Whole rows of memory then go through the derivatives of a choice of entries, not every third
-    number: they are several times as fast on a CPU.
-    """
-    return jnp.moveaxis(array, range(-axes, 0), range(axes))
-
-
-def from_entries(parts: Sequence[Any], axes: int) -> jax.Array:
-    """The array of nested lists of entries; inverts ``entries``."""
-    return jnp.moveaxis(jnp.array(parts), range(axes), range(-axes, 0))
-
-
-def cross_of(a: Any, b: Any) -> list[jax.Array]:
-    """Cross product of vectors given entry by entry."""
-    return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+    return dot_of(entries(a), entries(b))
 
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
     """Cross product [..., 3] of vectors [..., 3]."""
-    return from_entries(cross_of(entries(a, 1), entries(b, 1)), 1)
+    return from_entries(cross_of(entries(a), entries(b)))
+
+
+@jax.custom_jvp
+def entries(vector: jax.Array) -> list[jax.Array]:
+    """The D entries [...] of vectors [..., D].
+
+    Sums and products of whole [...] arrays compile to vector instructions, those of [..., 3] to
+    short loops.
+    """
+    return _split(vector)
+
+
+@entries.defjvp
+def _entries_jvp(primals, tangents):
+    # A sum of one entry and zeros, for the sake of its reverse: choices, as in from_entries.
+    (vector,), (change,) = primals, tangents
+    chosen = np.eye(vector.shape[-1], dtype=bool)
+    return _split(vector), [jnp.where(mask, change, 0).sum(-1) for mask in chosen]
+
+
+def from_entries(parts: Sequence[jax.Array]) -> jax.Array:
+    """Vectors [..., D] of D entries [...]; inverts ``entries``.
+
+    Choices compile to one loop that evaluates what the entries share once; XLA on a CPU evaluates
+    it anew for each operand of a concatenation, and all that this in turn shares.
+    """
+    index = np.arange(len(parts))
+    result = parts[0][..., None]
+    for i, part in enumerate(parts[1:], start=1):
+        result = jnp.where(index < i, result, part[..., None])
+    return result
+
+
+def rows(matrix: jax.Array) -> list[list[jax.Array]]:
+    """The entries [...] of matrices [..., I, J], as I lists of J."""
+    *batch, height, width = matrix.shape
+    flat = _split(matrix.reshape(*batch, height * width))
+    return [flat[i * width : (i + 1) * width] for i in range(height)]
+
+
+@jax.custom_jvp
+def from_rows(parts: Sequence[Sequence[jax.Array]]) -> jax.Array:
+    """Matrices [..., I, J], 9 entries or more, of I lists of J entries; inverts ``rows``."""
+    return jnp.stack([from_entries(row) for row in parts], axis=-2)
+
+
+@from_rows.defjvp
+def _from_rows_jvp(primals, tangents):
+    # The reverse of one concatenation cancels that of rows. XLA computes the operands of more than
+    # eight apart, so that nothing they share is evaluated anew.
+    (parts,), (changes,) = primals, tangents
+    flat = jnp.stack([entry for row in changes for entry in row], axis=-1)
+    return from_rows(parts), flat.reshape(*flat.shape[:-1], len(parts), len(parts[0]))
+
+
+def _split(vector: jax.Array) -> list[jax.Array]:
+    """The entries [...] of vectors [..., D], whose reverse is a concatenation."""
+    parts = jax.lax.split(vector, [1] * vector.shape[-1], axis=-1)
+    return [jax.lax.squeeze(part, [-1]) for part in parts]
+
+
+def dot_of(a: Sequence[jax.Array], b: Sequence[jax.Array]) -> jax.Array:
+    """Inner product of vectors given entry by entry."""
+    terms = [x * y for x, y in zip(a, b, strict=True)]
+    return sum(terms[1:], start=terms[0])
+
+
+def cross_of(a: Sequence[jax.Array], b: Sequence[jax.Array]) -> list[jax.Array]:
+    """Cross product of vectors given entry by entry."""
+    return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
 def norm(vector: jax.Array) -> jax.Array:

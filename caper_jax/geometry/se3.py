@@ -14,7 +14,19 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from caper_jax.geometry import so3
-from caper_jax.geometry.linalg import apply, as_floating, cross, dot, multiply, norm, transpose
+from caper_jax.geometry.linalg import (
+    apply,
+    as_floating,
+    cross_of,
+    dot_of,
+    entries,
+    from_entries,
+    from_rows,
+    multiply,
+    norm,
+    rows,
+    transpose,
+)
 
 
 def from_rt(rotation: ArrayLike, translation: ArrayLike) -> jax.Array:
@@ -49,23 +61,24 @@ def vee(matrix: ArrayLike) -> jax.Array:
 
 def exp(xi: ArrayLike) -> jax.Array:
     """Transform [..., 4, 4] of a twist (w, rho) [..., 6]."""
-    w, rho = _split(xi)
+    twist = entries(as_floating(xi, (6,), "xi"))
+    w, rho = twist[:3], twist[3:]
     first, second, third = so3.exp_coefficients_of(w)
-    along = dot(w, rho)
-    translation = (
-        first[..., None] * rho + second[..., None] * cross(w, rho) + (third * along)[..., None] * w
-    )
-    return from_rt(so3.exp(w), translation)
+    along, across = third * dot_of(w, rho), cross_of(w, rho)
+    translation = [first * rho[i] + second * across[i] + along * w[i] for i in range(3)]
+    zero = jnp.zeros_like(along)
+    top = [[*row, t] for row, t in zip(so3.exp_of(w), translation, strict=True)]
+    return from_rows([*top, [zero, zero, zero, zero + 1]])
 
 
 def log(transform: ArrayLike) -> jax.Array:
     """Twist (w, rho) [..., 6], |w| <= pi, of a transform [..., 4, 4]; see ``so3.log``."""
-    transform = as_floating(transform, (4, 4), "transform")
-    w, t = so3.log(transform[..., :3, :3]), transform[..., :3, 3]
-    first, second = so3.inverse_coefficients_of(w)
-    along = dot(w, t)
-    rho = first[..., None] * t - cross(w, t) / 2 + (second * along)[..., None] * w
-    return jnp.concatenate([w, rho], axis=-1)
+    top = rows(as_floating(transform, (4, 4), "transform"))[:3]
+    t = [row[3] for row in top]
+    w, first, second = so3.log_of([row[:3] for row in top])
+    along, across = second * dot_of(w, t), cross_of(w, t)
+    rho = [first * t[i] - across[i] / 2 + along * w[i] for i in range(3)]
+    return from_entries([*w, *rho])
 
 
 def left_jacobian(xi: ArrayLike) -> jax.Array:
@@ -151,7 +164,7 @@ def _block_lower(diagonal: jax.Array, lower: jax.Array) -> jax.Array:
 
 def _translation_block(w: jax.Array, rho: jax.Array) -> jax.Array:
     """Q(w, rho) [..., 3, 3]: how the translation of ``exp`` answers to a change of w."""
-    terms = so3.trigonometry(w)
+    terms = so3.trigonometry(entries(w))
     small, _, t, squared, sin, cos = terms
     cubic = so3.exp_coefficients(terms)[2]
     quartic = jnp.where(

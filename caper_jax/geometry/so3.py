@@ -30,11 +30,13 @@ from caper_jax.geometry.linalg import apply as apply
 from caper_jax.geometry.linalg import (
     as_floating,
     cross_of,
-    dot,
+    dot_of,
     entries,
     from_entries,
+    from_rows,
     multiply,
     norm,
+    rows,
     transpose,
 )
 
@@ -58,6 +60,9 @@ _GENERATORS = np.array(
     ]
 )
 
+# An axis and the two after it, in the order of the cross product.
+_CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+
 
 def hat(w: ArrayLike) -> jax.Array:
     """Skew matrix [..., 3, 3] of a vector [..., 3]: ``hat(w) @ v == cross(w, v)``."""
@@ -79,30 +84,33 @@ def exp(w: ArrayLike) -> jax.Array:
     Args:
       w: [..., 3] axis times angle, radians; any length.
     """
-    return _exp(as_floating(w, (3,), "w"))
+    return from_rows(exp_of(entries(as_floating(w, (3,), "w"))))
 
 
 @jax.custom_jvp
-def _exp(w: jax.Array) -> jax.Array:
+def exp_of(w: Sequence[jax.Array]) -> list[list[jax.Array]]:
+    """``exp`` of the entries [...] of a vector: three rows of three entries."""
     terms = trigonometry(w)
     first, second, _ = exp_coefficients(terms)
-    # The diagonal has two forms. 1 - c (y^2 + z^2) is exact near the identity; for an angle near
-    # pi about y or z it takes nearly 2 from 1, where cos t + c x^2 keeps one more bit.
-    squares = second[..., None] * w * w
-    others = _sum_of_others(squares)
-    near = terms.small[..., None] | (others < squares)
-    diagonal = jnp.where(near, 1 - others, terms.cos[..., None] + squares)
-    return _with_diagonal(diagonal, _off_diagonal(w, first, second))
+    squares = [second * x * x for x in w]
+    matrix = _off_diagonal(w, first, second)
+    for i, j, k in _CYCLES:
+        # The diagonal has two forms. 1 - c (y^2 + z^2) is exact near the identity; for an angle
+        # near pi about y or z it takes nearly 2 from 1, where cos t + c x^2 keeps one more bit.
+        others = squares[j] + squares[k]
+        near = terms.small | (others < squares[i])
+        matrix[i][i] = jnp.where(near, 1 - others, terms.cos + squares[i])
+    return matrix
 
 
-@_exp.defjvp
+@exp_of.defjvp
 def _exp_jvp(primals, tangents):
     (w,), (change,) = primals, tangents
-    rotation = _exp(w)
+    rotation = exp_of(w)
     _, first, second = exp_coefficients(trigonometry(w))
-    v = _twice_across(entries(w, 1), entries(change, 1), first, second)
-    columns = [cross_of(v, column) for column in entries(rotation, 2).swapaxes(0, 1)]
-    return rotation, from_entries([[column[i] for column in columns] for i in range(3)], 2)
+    v = _twice_across(w, change, first, second)
+    columns = [cross_of(v, column) for column in _columns(rotation)]
+    return rotation, _columns(columns)
 
 
 def log(rotation: ArrayLike) -> jax.Array:
@@ -111,13 +119,16 @@ def log(rotation: ArrayLike) -> jax.Array:
     At exactly pi the vector and its negative are the same rotation, and either may be returned.
     Derivatives are right along rotations; of another change, its part along them counts.
     """
-    return _log(as_floating(rotation, (3, 3), "rotation"))
+    w, _, _ = log_of(rows(as_floating(rotation, (3, 3), "rotation")))
+    return from_entries(w)
 
 
 @jax.custom_jvp
-def _log(rotation: jax.Array) -> jax.Array:
-    q = _quaternion(rotation)
-    real, vector = q[..., 0], q[..., 1:]
+def log_of(
+    rotation: Sequence[Sequence[jax.Array]],
+) -> tuple[list[jax.Array], jax.Array, jax.Array]:
+    """``log`` w of the entries [...] of a matrix, and the ``inverse_coefficients`` of w."""
+    real, *vector = _quaternion(rotation)
     squared, parts = _squared_length(vector)
     # w = 2 atan2(|v|, r) v / |v|; for |v| < 0.02 r as a series in (|v| / r)^2.
     small = squared < 4e-4 * real**2
@@ -128,26 +139,38 @@ def _log(rotation: jax.Array) -> jax.Array:
     # Beyond a quarter turn pi / 2 - atan2(r, |v|), whose rounding vanishes towards pi.
     beyond = length > real
     acute = jnp.arctan2(jnp.where(beyond, real, length), jnp.where(beyond, length, real))
-    quarter = np.asarray(math.pi / 2, q.dtype)
+    quarter = np.asarray(math.pi / 2, real.dtype)
     half = jnp.where(beyond, quarter - acute, acute)
     half_rest = ((quarter - half) - acute) + (math.pi / 2 - float(quarter))
     ratio = half / length
     rest = _minus_product(half, ratio, length) - ratio * length_rest
     rest = jax.lax.stop_gradient((rest + jnp.where(beyond, half_rest, 0.0)) / length)
     ratio, rest = jnp.where(small, series, ratio), jnp.where(small, 0.0, rest)
-    return 2 * (ratio[..., None] * vector + rest[..., None] * vector)
+    w = [2 * (ratio * v + rest * v) for v in vector]
+    # (t / 2) cot(t / 2) is t / 2 over |v|, times r.
+    first = ratio * real
+    squared = dot_of(w, w)
+    small = squared < _SERIES_BELOW
+    series = _horner(_BERNOULLI, jnp.where(small, squared, 0.0))
+    return w, first, jnp.where(small, series, (1 - first) / jnp.where(small, 1.0, squared))
 
 
-@_log.defjvp
+@log_of.defjvp
 def _log_jvp(primals, tangents):
     (rotation,), (change,) = primals, tangents
-    w = _log(rotation)
-    _, second = inverse_coefficients(trigonometry(w))
+    w, first, second = log_of(rotation)
     # The skew part of change R^T, as a sum over columns.
-    columns = zip(*(entries(r, 2).swapaxes(0, 1) for r in (rotation, change)), strict=True)
-    turns = [cross_of(old, new) for old, new in columns]
+    turns = [cross_of(a, b) for a, b in zip(*map(_columns, (rotation, change)), strict=True)]
     turned = [(a + b + c) / 2 for a, b, c in zip(*turns, strict=True)]
-    return w, from_entries(_twice_across(entries(w, 1), turned, -0.5, second), 1)
+    w_change = _twice_across(w, turned, -0.5, second)
+    slope = 2 * dot_of(w, w_change)
+    first_slope, second_slope = _inverse_coefficient_slopes(w, first, second)
+    return (w, first, second), (w_change, first_slope * slope, second_slope * slope)
+
+
+def _columns(matrix: Sequence[Sequence[jax.Array]]) -> list[list[jax.Array]]:
+    """Lists of the entries of the columns, of those of the rows."""
+    return [list(column) for column in zip(*matrix, strict=True)]
 
 
 def _twice_across(w, v, first, second) -> list[jax.Array]:
@@ -160,14 +183,14 @@ def _twice_across(w, v, first, second) -> list[jax.Array]:
 def left_jacobian(w: ArrayLike) -> jax.Array:
     """[..., 3, 3] J with ``exp(w + d) = exp(J d) exp(w)`` to first order; V of SE(3) alike."""
     w = as_floating(w, (3,), "w")
-    _, first, second = exp_coefficients(trigonometry(w))
+    _, first, second = exp_coefficients(trigonometry(entries(w)))
     return rodrigues(w, first, second)
 
 
 def left_jacobian_inverse(w: ArrayLike) -> jax.Array:
     """[..., 3, 3] inverse of ``left_jacobian``; singular at |w| = 2 pi, 4 pi, ... only."""
     w = as_floating(w, (3,), "w")
-    _, second = inverse_coefficients(trigonometry(w))
+    _, second = inverse_coefficients(trigonometry(entries(w)))
     return rodrigues(w, jnp.full_like(second, -0.5), second)
 
 
@@ -177,8 +200,8 @@ def angle(rotation: ArrayLike) -> jax.Array:
     2 atan2(|v|, r) of the quaternion (r, v) keeps seven digits in float32 at every angle, where
     arccos of the trace reads 0 for 0.01 deg; so does its derivative.
     """
-    q = _quaternion(as_floating(rotation, (3, 3), "rotation"))
-    return 2 * jnp.arctan2(norm(q[..., 1:]), q[..., 0])
+    real, *vector = _quaternion(rows(as_floating(rotation, (3, 3), "rotation")))
+    return 2 * jnp.arctan2(norm(from_entries(vector)), real)
 
 
 def geodesic_distance(rotation_a: ArrayLike, rotation_b: ArrayLike) -> jax.Array:
@@ -222,8 +245,8 @@ class Trigonometry(NamedTuple):
     cos: jax.Array
 
 
-def trigonometry(w: jax.Array) -> Trigonometry:
-    """Angle, sine and cosine of rotation vectors [..., 3]."""
+def trigonometry(w: Sequence[jax.Array]) -> Trigonometry:
+    """Angle, sine and cosine of a rotation vector, given entry by entry."""
     squared, parts = _squared_length(w)
     small = squared < _SERIES_BELOW
     series = jnp.where(small, squared, 0.0)
@@ -249,8 +272,8 @@ def exp_coefficients(terms: Trigonometry) -> tuple[jax.Array, jax.Array, jax.Arr
 
 
 @jax.custom_jvp
-def exp_coefficients_of(w: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """``exp_coefficients`` of vectors [..., 3], whose derivatives are again such coefficients."""
+def exp_coefficients_of(w: Sequence[jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """``exp_coefficients`` of entries [...], whose derivatives are again such coefficients."""
     return exp_coefficients(trigonometry(w))
 
 
@@ -266,29 +289,9 @@ def _exp_coefficients_jvp(primals, tangents):
         return jnp.where(terms.small, series, (1 / math.factorial(n) - before) / terms.squared)
 
     fourth, fifth = after(2, second), after(3, third)
-    slope = dot(w, change)
+    slope = dot_of(w, change)
     changes = ((third - second) * slope, (2 * fourth - third) * slope, (3 * fifth - fourth) * slope)
     return (first, second, third), changes
-
-
-@jax.custom_jvp
-def inverse_coefficients_of(w: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """``inverse_coefficients`` of vectors [..., 3]."""
-    return inverse_coefficients(trigonometry(w))
-
-
-@inverse_coefficients_of.defjvp
-def _inverse_coefficients_jvp(primals, tangents):
-    (w,), (change,) = primals, tangents
-    terms = trigonometry(w)
-    first, second = inverse_coefficients(terms)
-    slope = 2 * dot(w, change)
-    slope_first = (first * second - 0.25) / 2
-    weighted = [k * c for k, c in enumerate(_BERNOULLI)][1:]
-    slope_second = jnp.where(
-        terms.small, _horner(weighted, terms.series), -(slope_first + second) / terms.squared
-    )
-    return (first, second), (slope_first * slope, slope_second * slope)
 
 
 def inverse_coefficients(terms: Trigonometry) -> tuple[jax.Array, jax.Array]:
@@ -299,11 +302,27 @@ def inverse_coefficients(terms: Trigonometry) -> tuple[jax.Array, jax.Array]:
     return first, jnp.where(small, series, (1 - first) / squared)
 
 
+def _inverse_coefficient_slopes(
+    w: Sequence[jax.Array], first: jax.Array, second: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Derivatives [...] of ``inverse_coefficients`` by t^2."""
+    squared = dot_of(w, w)
+    small = squared < _SERIES_BELOW
+    slope_first = (first * second - 0.25) / 2
+    weighted = [k * c for k, c in enumerate(_BERNOULLI)][1:]
+    series = _horner(weighted, jnp.where(small, squared, 0.0))
+    closed = -(slope_first + second) / jnp.where(small, 1.0, squared)
+    return slope_first, jnp.where(small, series, closed)
+
+
 def rodrigues(vector: jax.Array, first: jax.Array, second: jax.Array) -> jax.Array:
     """``I + first hat(v) + second hat(v)^2`` [..., 3, 3] of v [..., 3] and two scalars [...]."""
-    # hat(v)^2 has the diagonal -(y^2 + z^2), ...: no cancellation for small angles.
-    diagonal = 1 - _sum_of_others(second[..., None] * vector * vector)
-    return _with_diagonal(diagonal, _off_diagonal(vector, first, second))
+    v = entries(vector)
+    matrix = _off_diagonal(v, first, second)
+    for i, j, k in _CYCLES:
+        # hat(v)^2 has the diagonal -(y^2 + z^2), ...: no cancellation for small angles.
+        matrix[i][i] = 1 - second * (v[j] * v[j] + v[k] * v[k])
+    return from_rows(matrix)
 
 
 def alternating_series(coefficient: Callable[[int], float], terms: Trigonometry) -> jax.Array:
@@ -311,9 +330,9 @@ def alternating_series(coefficient: Callable[[int], float], terms: Trigonometry)
     return _horner([(-1) ** k * coefficient(k) for k in range(_SERIES_TERMS)], terms.series)
 
 
-def _squared_length(v: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-    """|v|^2 [...] of [..., 3], rounded, and as an unrounded sum of two parts."""
-    coarse, fine = zip(*(_split(v[..., i]) for i in range(3)), strict=True)
+def _squared_length(v: Sequence[jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    """|v|^2 [...] of three entries, rounded, and as an unrounded sum of two parts."""
+    coarse, fine = zip(*(_split(x) for x in v), strict=True)
     parts = (
         coarse[0] ** 2 + coarse[1] ** 2 + coarse[2] ** 2,
         sum((2 * c + f) * f for c, f in zip(coarse, fine, strict=True)),
@@ -350,40 +369,33 @@ def _horner(coefficients: Sequence[float], x: jax.Array) -> jax.Array:
     return result
 
 
-def _quaternion(r: jax.Array) -> jax.Array:
-    """Quaternion [..., 4], of length 2 to 4, real part first and >= 0, of rotations [..., 3, 3]."""
-    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    wx, wy, wz = (r[..., i, j] - r[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
-    xy, xz, yz = (r[..., i, j] + r[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
+def _quaternion(r: Sequence[Sequence[jax.Array]]) -> list[jax.Array]:
+    """Quaternion, of length 2 to 4, real part first and >= 0, of the entries of a rotation."""
+    xx, yy, zz = r[0][0], r[1][1], r[2][2]
+    wx, wy, wz = (r[i][j] - r[j][i] for i, j in ((2, 1), (0, 2), (1, 0)))
+    xy, xz, yz = (r[i][j] + r[j][i] for i, j in ((0, 1), (0, 2), (1, 2)))
     diagonal = (1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz)
-    rows = (
+    columns = (
         (diagonal[0], wx, wy, wz),
         (wx, diagonal[1], xy, xz),
         (wy, xy, diagonal[2], yz),
         (wz, xz, yz, diagonal[3]),
     )
-    best = diagonal[0]
-    column = list(rows[0])
-    for d, row in zip(diagonal[1:], rows[1:], strict=True):
+    best, q = diagonal[0], list(columns[0])
+    for d, column in zip(diagonal[1:], columns[1:], strict=True):
         better = d > best
         best = jnp.where(better, d, best)
-        column = [jnp.where(better, new, old) for new, old in zip(row, column, strict=True)]
-    q = jnp.stack(column, axis=-1)
-    return jnp.where(q[..., :1] < 0, -q, q)
+        q = [jnp.where(better, new, old) for new, old in zip(column, q, strict=True)]
+    return [jnp.where(q[0] < 0, -x, x) for x in q]
 
 
-def _off_diagonal(vector: jax.Array, first: jax.Array, second: jax.Array) -> jax.Array:
-    """``first hat(v) + second v v^T`` [..., 3, 3]."""
-    outer = (second[..., None] * vector)[..., :, None] * vector[..., None, :]
-    return outer + hat(first[..., None] * vector)
-
-
-def _sum_of_others(values: jax.Array) -> jax.Array:
-    """(y + z, z + x, x + y) of (x, y, z) [..., 3]."""
-    values = values[..., None]
-    mask = 1 - np.eye(3, dtype=values.dtype)
-    return values[..., 0, :] * mask[0] + values[..., 1, :] * mask[1] + values[..., 2, :] * mask[2]
-
-
-def _with_diagonal(diagonal: jax.Array, matrix: jax.Array) -> jax.Array:
-    return jnp.where(np.eye(3, dtype=bool), diagonal[..., None], matrix)
+def _off_diagonal(
+    v: Sequence[jax.Array], first: jax.Array, second: jax.Array
+) -> list[list[jax.Array]]:
+    """Rows of ``first hat(v) + second v v^T``."""
+    scaled, outer = [first * x for x in v], [second * x for x in v]
+    matrix = [[a * x for x in v] for a in outer]
+    for i, j, k in _CYCLES:
+        matrix[j][k] = matrix[j][k] - scaled[i]
+        matrix[k][j] = matrix[k][j] + scaled[i]
+    return matrix
