@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -117,6 +118,24 @@ class TestShipped:
             errors, lost = player.play(video, range(6))
             assert lost[0] and errors[0].max() > 30
             right.append(not lost[5] and errors[5].max() < 15)
+        assert most(right)
+
+    def test_a_track_that_is_off_by_a_turn_is_turned_back(self, tracker, videos):
+        """By what stage II sees alone: the estimator is not asked. Not so what the user gave."""
+        settings = replace(tracker.config, policy="promote", patience=1000)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(jax, "jit", quick_jit)
+            player = Player(Tracker(tracker.estimator, settings), videos)
+        half = np.diag([-1.0, 1.0, -1.0])
+        right = []
+        for video in range(VIDEOS):
+            player.begin(video, half)
+            errors, _ = player.play(video, range(1, 3))
+            assert errors.min() > 150
+            nothing = np.zeros_like(player.tracker.state.turn)
+            player.tracker.state = replace(player.tracker.state, turn=nothing)
+            errors, _ = player.play(video, range(3, 12))
+            right.append(errors[-1].max() < 15)
         assert most(right)
 
     def test_a_jump_to_another_object_is_noticed(self, player):

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from caper_jax import categories
 from caper_jax.errors import CaperError
 from caper_jax.networks.increment import increment_numbers, increment_transform
+from caper_jax.networks.turns import NUM_TURNS, TURNS
 from caper_jax.tracking import keyframes
 from caper_jax.tracking.config import TrackerConfig
 from caper_jax.tracking.energy import chamfer_energy
@@ -257,6 +258,7 @@ def laptop_fix(root, state=0.0) -> Fix:
         labels=POINT_LABELS,
         constants=constants,
         sure=np.float32(1),
+        turn=np.zeros(NUM_TURNS, np.float32),
     )
 
 
@@ -288,12 +290,18 @@ class TestMisfit:
         assert found == pytest.approx((0.3 + 0.5 + 0.2) / 4 / span, rel=1e-4)
 
 
+def turned_answer(variables, points, labels, reference, *_):
+    """Stage II's: where it is asked about, with the estimator's joint state."""
+    return replace(variables, root=reference)
+
+
 @pytest.fixture(scope="module")
 def programs():
     """Settings -> compiled ``corrected``; the estimator answers with its ``variables``."""
     compiled = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(keyframes, "estimate_fix", lambda variables, *_: variables)
+        patch.setattr(keyframes, "measure", turned_answer)
         yield compiled
 
 
@@ -313,15 +321,16 @@ class TestCorrected:
             """(turn, shift and joint state found, variance, asked, replaced)."""
             lost, due = (flags.pop(name, False) for name in ("lost", "due"))
             doubtful = np.int32(flags.pop("doubtful", 3 * flags.pop("doubted", False)))
+            turned = np.int32(flags.pop("turned", 0))
             turn, shift, state = estimate
             tracked = laptop_fix(ROOT, 0.5)
             static = laptop_fix(ROOT @ rigid([0, turn, 0], [0, shift, 0]), state)
             key = tuple(flags.items())
             if key not in programs:
 
-                def corrected(static, points, tracked, state, due, doubtful):
+                def corrected(static, points, tracked, state, due, doubtful, turned):
                     state, settings = SimpleNamespace(**state), TrackerConfig(**flags)
-                    rest = due, doubtful, LAPTOP, None, settings
+                    rest = due, doubtful, turned, LAPTOP, None, settings
                     return keyframes.corrected(
                         static, points, None, tracked, misfit(tracked, points), state, *rest
                     )
@@ -330,7 +339,7 @@ class TestCorrected:
             points = in_camera(INSIDE, tracked if fits == "track" else static)
             state = {"variance": np.float32(variance) * np.ones(3, np.float32), "lost": lost}
             static = replace(static, sure=np.float32(sure))
-            fix, *found = programs[key](static, points, tracked, state, due, doubtful)
+            fix, *found = programs[key](static, points, tracked, state, due, doubtful, turned)
             assert found.pop(2) == (bool(found[1]) and (sure >= 0.5 or doubtful >= 5))
             along = np.linalg.inv(tracked.root) @ np.asarray(fix.root, float)
             turned = Rotation.from_matrix(along[:3, :3]).as_rotvec()[1]
@@ -399,6 +408,14 @@ class TestCorrected:
         found, _, asked, replaced = run(sure=0.4, lost=True)
         np.testing.assert_allclose(found, self.ESTIMATE, atol=1e-5)
         assert asked and replaced
+
+    def test_a_track_off_by_a_turn_is_turned_unasked(self, run):
+        quarter = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+        (turn,) = np.flatnonzero(np.isclose(TURNS, quarter, atol=1e-6).all((1, 2)))
+        found, variance, asked, replaced = run(turned=turn)
+        np.testing.assert_allclose(found, [np.pi / 2, 0, self.ESTIMATE[2]], atol=1e-5)
+        np.testing.assert_allclose(variance, self.STATIC, rtol=1e-5)
+        assert replaced and not asked
 
     def test_a_tracked_pose_is_promoted_unasked(self, run):
         found, _, asked, replaced = run(variance=0.1, due=True, policy="promote")

@@ -53,6 +53,17 @@ def turn_between(reference, truth) -> tuple[jax.Array, jax.Array]:
     return index, jnp.arccos(jnp.clip(cosine, -1.0, 1.0))
 
 
+def log_odds(logits) -> jax.Array:
+    """[..., 24] of every turn against none, in nats."""
+    return logits - logits[..., :1]
+
+
+def turned_pose(pose, turn) -> jax.Array:
+    """Poses [..., 4, 4] turned about their own origin by ``TURNS[turn]``, turn [...]."""
+    rotation = multiply(pose[..., :3, :3], jnp.asarray(TURNS, pose.dtype)[turn])
+    return pose.at[..., :3, :3].set(rotation)
+
+
 def chosen_turn(logits, margin: float) -> jax.Array:
     """[..., 3, 3] the likeliest turn by [..., 24] logits; no turn unless it leads by ``margin``.
 

@@ -41,6 +41,8 @@ class TrackerConfig:
         it; it does so where it fits its own boxes clearly better.
       sure: least confidence in both of the root's directions (Eq 18) at which a static estimate may
         correct or replace a track: from a closed drawer's back any side may be the front.
+      turned: sum over frames of the log odds that the track is off by a quarter or half turn, at
+        which that turn is made; for networks with a turn head, at most 1 nat per frame.
       misfit: mean distance of the points from their parts' boxes, relative to the object's
         diagonal, above which a frame contradicts the track.
       mismatch: share of unmatched points above which a frame contradicts the track.
@@ -62,6 +64,7 @@ class TrackerConfig:
     gate: float = 0.4
     patience: int = 3
     sure: float = 0.5
+    turned: float = 2.0
     misfit: float = 0.03
     mismatch: float = 0.5
     static_rotation: float = 0.1

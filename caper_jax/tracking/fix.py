@@ -7,6 +7,7 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from caper_jax.articulation.category import Category
 from caper_jax.estimator import estimate
@@ -14,10 +15,12 @@ from caper_jax.geometry import linalg, se3
 from caper_jax.networks.canonical import canonicalise
 from caper_jax.networks.caper import NetworkConfig, PartsNetwork
 from caper_jax.networks.increment import increment_transform
+from caper_jax.networks.turns import NUM_TURNS, log_odds
 from caper_jax.networks.voting import vote
 from caper_jax.tracking.registration import Tree, part_poses
 from caper_jax.tracking.state import Constants
 
+_NO_TURN = np.zeros(NUM_TURNS, np.float32)
 _MEMORY = 60.0  # frames over which joint parameters and sizes are averaged
 
 
@@ -32,6 +35,8 @@ class Fix:
       labels: [N] int32 part of every point.
       constants: joint parameters and sizes.
       sure: [] in [0, 1], the lesser confidence of the root's two directions (Eq 18); 1 of a track.
+      turn: [24] log odds that the reference is off by each turn of ``networks.turns``; zero where
+        nothing says so.
     """
 
     root: Any
@@ -40,6 +45,7 @@ class Fix:
     labels: Any
     constants: Constants
     sure: Any
+    turn: Any
 
 
 def measure(
@@ -78,6 +84,7 @@ def measure(
         labels=jnp.where(labels >= 0, labels, predicted),
         constants=constants,
         sure=jnp.asarray(1.0, points.dtype),
+        turn=_NO_TURN if output.turn is None else log_odds(output.turn[0]),
     )
 
 
@@ -101,6 +108,7 @@ def estimate_fix(variables, points, labels, category: Category, network: Network
             known=jnp.zeros(category.num_joints),
         ),
         sure=prediction.confidence[0].min(),
+        turn=_NO_TURN,
     )
 
 

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from caper_jax.geometry import linalg, se3, so3
+from caper_jax.networks.turns import turned_pose
 from caper_jax.tracking.config import TrackerConfig
-from caper_jax.tracking.fix import Fix, estimate_fix, misfit, own_coordinates
+from caper_jax.tracking.fix import Fix, estimate_fix, measure, misfit, own_coordinates
 from caper_jax.tracking.registration import (
     Surface,
     empty_surface,
@@ -52,6 +53,7 @@ def corrected(
     state: TrackerState,
     due,
     doubtful,
+    turned,
     category,
     network,
     config: TrackerConfig,
@@ -60,7 +62,8 @@ def corrected(
 
     Where the track is in order, the static estimator's pose is weighed against it by their
     variances, one Kalman step on the manifold; where it is lost, or doubted and worse than the
-    estimate by its own measure, the estimate replaces it.
+    estimate by its own measure, the estimate replaces it. Where it is off by a whole turn, what
+    stage II sees after that turn does.
 
     Args:
       variables, points, labels, category, network: as for ``fix.measure``.
@@ -70,6 +73,7 @@ def corrected(
       due: [] bool, the policy wants a keyframe.
       doubtful: [] int32, so many frames in a row, this one included, contradicted the track; from
         ``patience`` on it is doubted.
+      turned: [] int32, by which turn the track is off; 0: by none.
       config: static.
 
     Returns:
@@ -85,9 +89,16 @@ def corrected(
         lambda: estimate_fix(variables, points, labels, category, network),
         lambda: tracked,
     )
+    static = jax.lax.cond(
+        turned > 0,
+        lambda: measure(
+            variables, points, labels, turned_pose(tracked.root, turned), category, network
+        ),
+        lambda: static,
+    )
     sure = asked & ((static.sure >= config.sure) | (doubtful >= config.patience + _LONG))
     better = misfit(static, points) < _BETTER * outside
-    replaced = state.lost | (doubted & sure & better)
+    replaced = state.lost | (doubted & sure & better) | (turned > 0)
 
     static_variance = jnp.square(
         jnp.array([config.static_rotation, config.static_translation, config.static_joint])
@@ -111,6 +122,7 @@ def corrected(
         labels=tracked.labels,
         constants=tracked.constants,
         sure=tracked.sure,
+        turn=tracked.turn,
     )
     fix = select(replaced, static, fused)
     # (1 - gain) grown, which would cancel where the gain is nearly one.

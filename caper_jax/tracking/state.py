@@ -82,6 +82,7 @@ class TrackerState:
       accepted: [] the misfit that the static estimator was asked about and could not better, so
         that objects of unusual size are not doubted again and again.
       doubtful: [] int32, frames in a row that disagreed with the track.
+      turn: [24] log odds, over the frames so far, that the track is off by a turn.
       lost: [] bool, the next frame with points starts afresh from the static estimator.
     """
 
@@ -96,4 +97,5 @@ class TrackerState:
     surface: Surface
     accepted: Any
     doubtful: Any
+    turn: Any
     lost: Any

@@ -14,6 +14,7 @@ from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.estimator import SMALLEST_SIZE
 from caper_jax.geometry import se3
 from caper_jax.networks.caper import NetworkConfig
+from caper_jax.networks.turns import NUM_TURNS
 from caper_jax.tracking.config import TrackerConfig
 from caper_jax.tracking.energy import chamfer_energy
 from caper_jax.tracking.fix import Fix, averaged, diagonal, measure, misfit
@@ -41,6 +42,7 @@ from caper_jax.tracking.registration import (
 from caper_jax.tracking.state import Constants, Keyframe, Observation, TrackerState
 
 _ACCEPTED = 1.3  # how much worse than an accepted misfit contradicts again
+_GIVEN = 60.0  # nats against a turn of a pose that the user gave
 _ENERGY_STRIDE = 2  # every so-manieth point enters the energy
 
 
@@ -98,6 +100,7 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
         surface=empty_surface(config.registration),
         accepted=jnp.zeros(()),
         doubtful=jnp.asarray(0, jnp.int32),
+        turn=jnp.zeros(NUM_TURNS),
         lost=jnp.asarray(True),
     )
 
@@ -138,6 +141,7 @@ def given_state(
         constants=fix.constants,
         keyframe=make_keyframe(fix, points),
         surface=grown_surface(begin.surface, fix, points, config),
+        turn=begin.turn - _GIVEN,
         lost=jnp.asarray(False),
     )
 
@@ -188,7 +192,10 @@ def track_step(
         expected = _expectations(config.registration, predicted, (root, joints))
         root, joints, information = register(*against, start, expected, config.registration)
         root = hold_still(state.root, root, information, config.registration.hold)
-    tracked = Fix(root, joints, parts.at(joints), found.labels, constants, found.sure)
+    tracked = Fix(root, joints, parts.at(joints), found.labels, constants, found.sure, found.turn)
+    turn = _turn_evidence(state, found.turn, config)
+    due_turn = (turn.max() > config.turned) & ~state.lost
+    turned = jnp.where(due_turn, turn.argmax(), 0).astype(jnp.int32)
 
     unmatched = mismatch(*against, (root, joints), config.registration)
     outside = misfit(tracked, points)
@@ -216,6 +223,7 @@ def track_step(
         state,
         due,
         doubtful,
+        turned,
         category,
         network,
         config,
@@ -253,6 +261,7 @@ def track_step(
         ),
         # A pose from the static estimator alone is on trial: one contradiction undoes it.
         doubtful=jnp.where(replaced, config.patience - 1, jnp.where(settled, 0, doubtful)),
+        turn=jnp.where(replaced, 0.0, turn),
         lost=jnp.asarray(False),
     )
     held = replace(
@@ -269,6 +278,16 @@ def track_step(
         estimated=asked & frame.present,
         lost=~frame.present | (contradicted & ~replaced),
     )
+
+
+def _turn_evidence(state: TrackerState, found, config: TrackerConfig):
+    """Log odds [24] of turns after this frame.
+
+    Frames show the same object from nearly the same side, so that each counts for little; and what
+    a closed object hides must not weigh more than what the open one then shows.
+    """
+    least = jnp.minimum(state.turn, -config.turned)
+    return jnp.maximum(state.turn + jnp.clip(found, -1.0, 1.0), least)
 
 
 def _expectations(config: RegistrationConfig, predicted, found):
