@@ -78,7 +78,7 @@ def test_a_loss_of_a_quarter_is_named(ratios, slower, capsys):
 
 def test_gate_measures_again_before_it_fails(monkeypatch, tmp_path, capsys):
     path = tmp_path / "baseline.json"
-    path.write_text(json.dumps(BASELINE))
+    path.write_text(json.dumps({"other": {"log": 9.0}, timing.processor(): BASELINE}))
     monkeypatch.setattr(gate, "measured", lambda: {name: (name, None) for name in BASELINE})
     found = {"estimator": iter([1.0, 2.1]), "log": iter([0.1, 0.2])}
     monkeypatch.setattr(gate, "ratio", lambda ours, reference, repeats: next(found[ours]))
@@ -90,21 +90,29 @@ def test_gate_measures_again_before_it_fails(monkeypatch, tmp_path, capsys):
     found.update({"estimator": iter([5.0]), "log": iter([0.5])})
     arguments = ["benchmark", "gate", "--update", "--baseline", str(path)]
     assert cli.main([*arguments, "--json", str(tmp_path / "out.json")]) == 0
-    assert gate.read_baseline(path) == {"estimator": 5.0, "log": 0.5}
+    own = {"estimator": 5.0, "log": 0.5}
+    assert gate.read_baselines(path) == {"other": {"log": 9.0}, timing.processor(): own}
     report = json.loads((tmp_path / "out.json").read_text())
     assert {row["verdict"] for row in report["rows"]} == {"ok"}
 
+    path.write_text(json.dumps({"other": {"log": 9.0}}))
+    found.update({"estimator": iter([1.0]), "log": iter([0.1])})
+    capsys.readouterr()
+    assert cli.main(["benchmark", "gate", "--baseline", str(path)]) == 0
+    assert "no baseline of a" in capsys.readouterr().err
 
-@pytest.mark.parametrize("text", ["", "[]", '{"a": 0}', '{"a": "fast"}'])
+
+@pytest.mark.parametrize("text", ["", "[]", '{"a": 1}', '{"x": {"a": 0}}', '{"x": {"a": "fast"}}'])
 def test_a_damaged_baseline(text, tmp_path):
     path = tmp_path / "baseline.json"
     path.write_text(text)
     with pytest.raises(CaperError, match=r"baseline\.json"):
-        gate.read_baseline(path)
+        gate.read_baselines(path)
 
 
 def test_the_committed_baseline():
-    assert len(gate.read_baseline(gate.BASELINE)) >= 8
+    baselines = gate.read_baselines(gate.BASELINE)
+    assert baselines and all(len(ratios) >= 8 for ratios in baselines.values())
 
 
 def test_stages_of_a_profile():

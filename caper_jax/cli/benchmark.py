@@ -98,12 +98,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def machine() -> dict[str, Any]:
-    """What a figure depends on: cores, load, versions, device."""
+    """What a figure depends on: processor, load, versions, device."""
     import jax
 
     # What this process may use, where the system says so.
     affinity = getattr(os, "sched_getaffinity", None)
     return {
+        "processor": timing.processor(),
         "cores": os.cpu_count() if affinity is None else len(affinity(0)),
         "load_average": timing.load_average(),
         "jax": jax.__version__,

@@ -7,7 +7,8 @@ from caper_jax.networks.caper import NetworkConfig
 from caper_jax.networks.heads import HeadConfig
 
 PRESETS: dict[str, NetworkConfig] = {
-    "paper": NetworkConfig(encoder="hs"),
+    # As published: stage I, then stage II. Correcting stage I's pose is ours.
+    "paper": NetworkConfig(encoder="hs", corrections=0),
     "fast": NetworkConfig(
         encoder="fast",
         root_heads=HeadConfig(widths=(256, 256, 256), dropout=0.0, pool_first=True),

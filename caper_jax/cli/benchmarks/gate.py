@@ -1,7 +1,9 @@
-"""``caper benchmark gate``: has a change made anything slower, whatever the machine?
+"""``caper benchmark gate``: has a change made anything slower?
 
 Each ratio is the time of a plain computation over the time of ours, measured in turn in one
-process, so that most of what differs between machines cancels; the committed ones are compared.
+process, so that what else the machine does cancels. Between kinds of processors it does not: one
+that multiplies matrices twice as fast halves the ratio of what is no matrix product. The committed
+ratios are therefore kept by processor.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--baseline", type=Path, default=BASELINE, metavar="FILE", help="(default: the committed)"
     )
     parser.add_argument(
-        "--update", action="store_true", help="write what is measured there, and pass"
+        "--update", action="store_true", help="write what is measured there, for this processor"
     )
 
 
@@ -41,38 +43,50 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """The ratios beside the baseline's; one that fell is measured once more before it counts."""
     calls = measured()
     ratios = {name: ratio(*pair, arguments.repeats) for name, pair in calls.items()}
+    baselines, processor = read_baselines(arguments.baseline), timing.processor()
     if arguments.update:
-        text = json.dumps({name: round(value, 4) for name, value in ratios.items()}, indent=1)
+        baselines[processor] = {name: round(value, 4) for name, value in ratios.items()}
+        text = json.dumps(baselines, indent=1, sort_keys=True)
         write_atomically(arguments.baseline, (text + "\n").encode())
-    baseline = read_baseline(arguments.baseline)
+    baseline = baselines.get(processor, {})
     for name in fallen(ratios, baseline):
         ratios[name] = max(ratios[name], ratio(*calls[name], 2 * arguments.repeats))
     yield from compare(ratios, baseline)
 
 
 def verdict(rows: Sequence[Mapping[str, Any]]) -> int:
-    """Exit code 1, and the names on standard error, where a ratio fell by ``LOSS``."""
+    """Exit code 1, and the names on standard error, where a ratio fell by ``LOSS``.
+
+    Where this kind of processor has no baseline that is said, and nothing can fail.
+    """
+    if all(row["baseline"] == "-" for row in rows):
+        print(
+            f"nothing to compare with: no baseline of a {timing.processor()}; --update writes one",
+            file=sys.stderr,
+        )
     slower = [f"{row['what']} ({row['change_%']:+.0f} %)" for row in rows if row["verdict"] != "ok"]
     if slower:
         print(f"slower than the baseline: {', '.join(slower)}", file=sys.stderr)
     return int(bool(slower))
 
 
-def read_baseline(path: Path) -> dict[str, float]:
-    """The committed ratios.
+def read_baselines(path: Path) -> dict[str, dict[str, float]]:
+    """The committed ratios by kind of processor.
 
     Raises:
-      CaperError: no such file, or not a JSON object of numbers above 0.
+      CaperError: not a JSON object of objects of numbers above 0.
     """
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise CaperError(f"{path} is not valid JSON: {error}") from error
     good = isinstance(found, dict) and all(
-        isinstance(value, int | float) and value > 0 for value in found.values()
+        isinstance(ratios, dict)
+        and all(isinstance(value, int | float) and value > 0 for value in ratios.values())
+        for ratios in found.values()
     )
     if not good:
-        raise CaperError(f"{path} must hold ratios above 0 by name")
+        raise CaperError(f"{path} must hold ratios above 0 by processor and name")
     return found
 
 

@@ -86,7 +86,19 @@ def _draw(path: Path, rows: Sequence[dict[str, Any]], preset: str) -> None:
         own = [row for row in rows if row["varied"] == name]
         for axes, (key, label) in zip(grid[:, column], quantities, strict=True):
             sizes = [row["size"] for row in own]
-            axes.loglog(sizes, [row[key] for row in own], marker="o", base=2)
+            values = [row[key] for row in own]
+            axes.loglog(sizes, values, marker="o", base=2)
+            for place in zip(sizes, values, strict=True):
+                axes.annotate(
+                    f"{place[1]:.3g}",
+                    place,
+                    (0, 6),
+                    textcoords="offset points",
+                    ha="center",
+                    fontsize=8,
+                )
+            axes.set_yticks([])
+            axes.margins(0.12, 0.2)
             axes.set_xticks(sizes, [str(size) for size in sizes], fontsize=8)
             axes.minorticks_off()
             axes.set_xlabel(name)

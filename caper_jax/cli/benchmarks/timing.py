@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import platform
 import statistics
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 
@@ -57,6 +59,16 @@ def elementwise() -> Callable[[], Any]:
     numbers = jax.device_put(np.linspace(0.0, 3.0, 6_000_000, dtype=np.float32))
     function = jax.jit(lambda x: jnp.sin(x) * jnp.cos(x))
     return lambda: function(numbers)
+
+
+def processor() -> str:
+    """What kind of processor this is, as the system calls it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(named, platform.processor() or platform.machine())
 
 
 def load_average() -> float:
