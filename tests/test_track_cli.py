@@ -160,6 +160,8 @@ def test_videos_masks_and_settings_are_chosen(files, scripted, capsys):
 def test_a_folder_has_no_truth_and_may_lose_the_object(files, scripted, capsys):
     home = write_video(files / "kitchen")
     (home / "mask" / "f2.png").unlink()
+    (files / "out").mkdir()
+    (files / "out" / "metrics.json").write_text("{}")  # of an earlier run, on data with truth
     assert run("--data", "kitchen", "--out", "out") == 0
     assert sorted(os.listdir("out")) == ["kitchen.jsonl", "kitchen.png", "kitchen_states.png"]
     text = (files / "out" / "kitchen.jsonl").read_text()

@@ -134,6 +134,7 @@ def track_all(
     facts = (arguments.start, dataset.mask_source, part_masks)
     measured = [track for track in tracks if track.truth is not None]
     metrics = None
+    (out / METRICS_FILE).unlink(missing_ok=True)  # an earlier run's would stand beside these tracks
     if sum(len(track.frames) - 1 for track in measured):
         metrics = summarise_tracks(measured, category, *facts)
         metrics |= {
