@@ -37,7 +37,7 @@ from caper_jax.networks.caper import (
     shared_neighbourhoods,
 )
 from caper_jax.networks.increment import increment_transform
-from caper_jax.networks.turns import chosen_turn
+from caper_jax.networks.turns import chosen_turn, turned_pose
 from caper_jax.networks.voting import vote
 
 # Part sizes are residuals to a mean; nothing else keeps a regression from going below zero.
@@ -123,8 +123,7 @@ def estimate(
         canonical = canonicalise(cloud, pose[:, :3, :3], pose[:, :3, 3])
         output = apply("parts", parts_network, canonical)
         if output.turn is not None:
-            turned = multiply(pose[:, :3, :3], chosen_turn(output.turn, network.turn_margin))
-            pose = se3.from_rt(turned, pose[:, :3, 3])
+            pose = turned_pose(pose, chosen_turn(output.turn, network.turn_margin))
         pose = se3.compose(pose, increment_transform(output.increment, network.increment))
     canonical = canonicalise(cloud, pose[:, :3, :3], pose[:, :3, 3])
     parts = apply("parts", parts_network, canonical)

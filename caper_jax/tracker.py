@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from caper_jax.configuration import from_dict, override
-from caper_jax.data.cloud import MIN_POINTS, sample_points
+from caper_jax.data.cloud import MIN_POINTS, is_measured, sample_points
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load
 from caper_jax.tracking.config import TrackerConfig
@@ -107,8 +107,7 @@ class Tracker:
         if points.ndim != 2 or points.shape[1] != 3:
             raise CaperError(f"points must be [N, 3], got shape {points.shape}")
         unknown = np.full(count, -1, np.int32)
-        usable = np.isfinite(points).all(1) & (points != 0).any(1)
-        if usable.sum() < MIN_POINTS:
+        if is_measured(points).sum() < MIN_POINTS:
             nothing = np.zeros((count, 3), np.float32)
             return Observation(nothing, np.asarray(False), unknown)
         cloud = sample_points(points, count)

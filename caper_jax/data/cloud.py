@@ -148,6 +148,11 @@ def back_project(
     return np.stack([x, y, depth], axis=-1).astype(np.float32)
 
 
+def is_measured(points: np.ndarray) -> np.ndarray:
+    """Which points [..., 3] are any: NaN, infinity and zero stand for no measurement."""
+    return np.isfinite(points).all(-1) & (points != 0).any(-1)
+
+
 def sample_points(
     points: np.ndarray,
     num_points: int = 1024,
@@ -178,7 +183,7 @@ def sample_points(
     if points.dtype.kind not in "fiu":
         raise CaperError(f"{where}: a cloud must be numbers in metres, got {points.dtype}")
     cast = points.astype(np.float32)
-    kept = np.flatnonzero(np.isfinite(cast).all(-1) & (cast != 0).any(-1))
+    kept = np.flatnonzero(is_measured(cast))
     _check_count(len(kept), f"of {len(points)} points in {where}")
     median_depth = float(np.median(cast[kept, 2]))
     if abs(median_depth) > _FARTHEST_M:
@@ -212,7 +217,7 @@ def are_sampled(clouds: np.ndarray, num_points: int) -> bool:
     if clouds.shape[1] != num_points or clouds.dtype.kind not in "fiu":
         return False
     cast = clouds.astype(np.float32)
-    if not (np.isfinite(cast).all() and (cast != 0).any(-1).all()):
+    if not is_measured(cast).all():
         return False
     depth = np.median(cast[..., 2], axis=1)
     return bool(((depth > 0) & (depth <= _FARTHEST_M)).all())

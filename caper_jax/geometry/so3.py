@@ -149,10 +149,8 @@ def log_of(
     w = [2 * (ratio * v + rest * v) for v in vector]
     # (t / 2) cot(t / 2) is t / 2 over |v|, times r.
     first = ratio * real
-    squared = dot_of(w, w)
-    small = squared < _SERIES_BELOW
-    series = _horner(_BERNOULLI, jnp.where(small, squared, 0.0))
-    return w, first, jnp.where(small, series, (1 - first) / jnp.where(small, 1.0, squared))
+    small, x, squared = _by_size(dot_of(w, w))
+    return w, first, jnp.where(small, _horner(_BERNOULLI, x), (1 - first) / squared)
 
 
 @log_of.defjvp
@@ -248,13 +246,20 @@ class Trigonometry(NamedTuple):
 def trigonometry(w: Sequence[jax.Array]) -> Trigonometry:
     """Angle, sine and cosine of a rotation vector, given entry by entry."""
     squared, parts = _squared_length(w)
-    small = squared < _SERIES_BELOW
-    series = jnp.where(small, squared, 0.0)
-    squared = jnp.where(small, 1.0, squared)
+    small, series, squared = _by_size(squared)
     t, rest = _sqrt(squared, parts)
     rest = jnp.where(small, 0.0, rest)
     sin, cos = jnp.sin(t), jnp.cos(t)
     return Trigonometry(small, series, t, squared, sin + cos * rest, cos - sin * rest)
+
+
+def _by_size(squared: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Whether t^2 [...] is for a series; what the series takes, and what closed forms take.
+
+    Each is a harmless number where it is not used, so that no derivative meets 0 / 0.
+    """
+    small = squared < _SERIES_BELOW
+    return small, jnp.where(small, squared, 0.0), jnp.where(small, 1.0, squared)
 
 
 def exp_coefficients(terms: Trigonometry) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -306,13 +311,11 @@ def _inverse_coefficient_slopes(
     w: Sequence[jax.Array], first: jax.Array, second: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Derivatives [...] of ``inverse_coefficients`` by t^2."""
-    squared = dot_of(w, w)
-    small = squared < _SERIES_BELOW
+    small, x, squared = _by_size(dot_of(w, w))
     slope_first = (first * second - 0.25) / 2
     weighted = [k * c for k, c in enumerate(_BERNOULLI)][1:]
-    series = _horner(weighted, jnp.where(small, squared, 0.0))
-    closed = -(slope_first + second) / jnp.where(small, 1.0, squared)
-    return slope_first, jnp.where(small, series, closed)
+    closed = -(slope_first + second) / squared
+    return slope_first, jnp.where(small, _horner(weighted, x), closed)
 
 
 def rodrigues(vector: jax.Array, first: jax.Array, second: jax.Array) -> jax.Array:

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from caper_jax.geometry import se3
 from caper_jax.networks.canonical import multiply
 
 
@@ -58,10 +59,9 @@ def log_odds(logits) -> jax.Array:
     return logits - logits[..., :1]
 
 
-def turned_pose(pose, turn) -> jax.Array:
-    """Poses [..., 4, 4] turned about their own origin by ``TURNS[turn]``, turn [...]."""
-    rotation = multiply(pose[..., :3, :3], jnp.asarray(TURNS, pose.dtype)[turn])
-    return pose.at[..., :3, :3].set(rotation)
+def turned_pose(pose, rotation) -> jax.Array:
+    """Poses [..., 4, 4] turned about their own origin by rotations [..., 3, 3]."""
+    return se3.from_rt(multiply(pose[..., :3, :3], rotation), pose[..., :3, 3])
 
 
 def chosen_turn(logits, margin: float) -> jax.Array:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from caper_jax.geometry import linalg, se3, so3
-from caper_jax.networks.turns import turned_pose
+from caper_jax.networks.turns import TURNS, turned_pose
 from caper_jax.tracking.config import TrackerConfig
 from caper_jax.tracking.fix import Fix, estimate_fix, measure, misfit, own_coordinates
 from caper_jax.tracking.registration import (
@@ -89,11 +89,10 @@ def corrected(
         lambda: estimate_fix(variables, points, labels, category, network),
         lambda: tracked,
     )
+    reference = turned_pose(tracked.root, jnp.asarray(TURNS, tracked.root.dtype)[turned])
     static = jax.lax.cond(
         turned > 0,
-        lambda: measure(
-            variables, points, labels, turned_pose(tracked.root, turned), category, network
-        ),
+        lambda: measure(variables, points, labels, reference, category, network),
         lambda: static,
     )
     sure = asked & ((static.sure >= config.sure) | (doubtful >= config.patience + _LONG))

@@ -24,7 +24,7 @@ from caper_jax.networks.canonical import (
 )
 from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
 from caper_jax.networks.increment import increment_numbers, increment_transform
-from caper_jax.networks.turns import HALF_TURNS, NUM_TURNS, TURNS, turn_between
+from caper_jax.networks.turns import HALF_TURNS, NUM_TURNS, TURNS, turn_between, turned_pose
 from caper_jax.networks.voting import vote
 from caper_jax.training import losses
 from caper_jax.training.losses import HeatmapKind, LossWeights
@@ -133,7 +133,7 @@ class Task:
             parts_losses = {name: value * right for name, value in parts_losses.items()}
             parts_losses["turn"] = losses.turn_loss(parts.turn, turn)
             metrics["turn_accuracy"] = (parts.turn.argmax(-1) == turn).mean()
-            reference = se3.compose(reference, _turn_transform(turn))
+            reference = turned_pose(reference, jnp.asarray(TURNS)[turn])
         increment_loss, off = self._increment_loss(parts.increment, reference, truth)
         parts_losses["twist"] = increment_loss
         metrics["increment_deg"] = off
@@ -260,8 +260,8 @@ class Task:
         drawn = jnp.where(jax.random.bernoulli(keys[2], 0.5, shape), half, some)
         chosen = jax.random.bernoulli(keys[3], self.config.turned, shape) & (turn == 0)
         drawn = jnp.where(chosen, drawn, 0)
-        away = transpose(_turn_transform(drawn))  # no translation: this is its inverse
-        return se3.compose(reference, away), jnp.where(chosen, drawn, turn)
+        away = transpose(jnp.asarray(TURNS)[drawn])
+        return turned_pose(reference, away), jnp.where(chosen, drawn, turn)
 
     def _increment_loss(self, numbers, reference, truth: ArticulatedPose):
         """Eq 21 for the increment from the reference to the true root pose (Eq 10).
@@ -308,9 +308,3 @@ class Task:
             name, factor = ("deg", 180 / np.pi) if kind == "revolute" else ("unit", 1.0)
             metrics[f"state{number + 1}_{name}"] = off[number] * factor
         return parts, metrics
-
-
-def _turn_transform(turn):
-    """[B, 4, 4] of turns [B] about the root's origin."""
-    rotation = jnp.asarray(TURNS)[turn]
-    return se3.from_rt(rotation, jnp.zeros((*turn.shape, 3), rotation.dtype))
