@@ -139,7 +139,9 @@ def test_keyboards_lie_in_a_plane_level_or_sloping_to_the_front(laptops):
         slope = np.degrees(np.arctan2(top[2] - top[0], z[0] - z[2]))
         assert slope > -0.1 and min(slope, np.ptp(bottom) * 100) < 0.1  # one of the two is level
         slopes.append(slope)
-        keys = [solid for solid in others if solid.kind == "box" and solid.center[1] > base.center[1]]
+        keys = [
+            solid for solid in others if solid.kind == "box" and solid.center[1] > base.center[1]
+        ]
         for key in keys[:3]:  # half sunk in the top, whatever its slope
             middle = np.interp(key.center[2], z[::-1], top[::-1])
             assert abs(key.center[1] - middle) < 0.0015

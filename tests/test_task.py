@@ -93,9 +93,9 @@ def frames(category, sizes, seed=0, count=64):
 class Oracle(Task):
     """A task whose networks answer what they are told to, in place of weights.
 
-    ``params`` is (pose [B, ...], labels [B, N], view [B, 3, 3], error [3, 3] of the root in the
-    viewing frame); the points that each stage is given come back as its state. Stage II's increment
-    is that from the reference its points were canonicalised with (Eq 10).
+    ``params`` of either stage is (pose [B, ...], labels [B, N], view [B, 3, 3], error [3, 3] of the
+    root in the viewing frame); the points that each stage is given come back as its state. Stage
+    II's increment is that from the reference its points were canonicalised with (Eq 10).
     """
 
     def _noisy_root(self, key, output, truth):
@@ -153,7 +153,7 @@ class Oracle(Task):
             self._jitted = jax.jit(lambda params, batch: self.loss(params, *self._rest(batch)))
         view = view_rotation(batch.points)
         params = (pose, jnp.asarray(labels), view, jnp.asarray(error.as_matrix(), jnp.float32))
-        total, (state, metrics) = self._jitted(params, batch)
+        total, (state, metrics) = self._jitted({"root": params, "parts": params}, batch)
         return total, np.asarray(state["seen"]["parts"]), metrics
 
     @staticmethod

@@ -67,10 +67,10 @@ def _base(rng: np.random.Generator, width: float, depth: float, thickness: float
         thin = rng.uniform(0.3, 0.7) if body == "teardrop" else rng.uniform(0.1, 0.7)
         up = 1 if body == "teardrop" else -1
         half_slope = np.arctan2(thickness * (1 - thin) / 2, depth)
-        center = (0, up * thickness * (1 - thin) / 4, 0)
-        solids = [frustum(center, half, (1.0, thin), about("x", -up * half_slope))]
+        middle = (0, up * thickness * (1 - thin) / 4, 0)
+        solids = [frustum(middle, half, (1.0, thin), about("x", -up * half_slope))]
         if body == "sloped":
-            tilt, edge = about("x", 2 * half_slope), (0, top, -depth / 2)
+            tilt, edge = about("x", 2 * half_slope), (0.0, top, -depth / 2)
             keyboard = [turned(key, tilt, edge) for key in keyboard]
     elif body == "wedge":  # cut off from below towards the front
         rise = np.arctan2(thickness * rng.uniform(0.3, 0.6), depth)

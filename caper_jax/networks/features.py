@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -71,22 +72,25 @@ class BlockDense(nn.Module):
       width: output channels.
       with_points: whether the centred coordinates are part of the concatenation (the translation
         and joint heads of the paper).
+      dot_general: of the dense layers, see ``nn.Dense``.
     """
 
     width: int
     with_points: bool = False
+    dot_general: Any = None
 
     @nn.compact
     def __call__(self, features: Features):
         """Features -> [B, N, width]."""
+        dense = partial(Dense, self.width, dot_general=self.dot_general)
         total: Any = 0.0
         for number, level in enumerate(features.levels):
             bias = number == 0
-            part = Dense(self.width, use_bias=bias, name=f"level{number}")(level.features)
+            part = dense(use_bias=bias, name=f"level{number}")(level.features)
             total += level.at_points(part)
         if self.with_points:
-            total += Dense(self.width, use_bias=False, name="points")(features.points)
+            total += dense(use_bias=False, name="points")(features.points)
         if features.shared is not None:
-            shared = Dense(self.width, use_bias=False, name="shared")(features.shared)
+            shared = dense(use_bias=False, name="shared")(features.shared)
             total += shared[:, None, :]
         return total

@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from caper_jax.networks.features import BlockDense, Features
-from caper_jax.networks.layers import BatchNorm, Dense
+from caper_jax.networks.layers import BatchNorm, Dense, weights_first
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,13 @@ class HeadConfig:
 
 def _norm_relu(features, train: bool):
     return nn.relu(BatchNorm(use_running_average=not train, momentum=0.9)(features))
+
+
+def _pointwise(features: Features, first: int, second: int, with_points: bool, train: bool):
+    """The two layers at every point, [B, N, second]."""
+    dot_general = weights_first if train else None
+    hidden = BlockDense(first, with_points, dot_general)(features)
+    return _norm_relu(Dense(second, dot_general=dot_general)(_norm_relu(hidden, train)), train)
 
 
 class PooledHead(nn.Module):
@@ -57,8 +64,7 @@ class PooledHead(nn.Module):
             hidden = nn.leaky_relu(Dense(first)(hidden))
             hidden = nn.leaky_relu(Dense(second)(hidden))
         else:
-            hidden = _norm_relu(BlockDense(first, self.with_points)(features), train)
-            hidden = _norm_relu(Dense(second)(hidden), train).max(axis=1)
+            hidden = _pointwise(features, first, second, self.with_points, train).max(axis=1)
             hidden = _norm_relu(Dense(third)(hidden), train)
         hidden = nn.Dropout(self.config.dropout, deterministic=not train)(hidden)
         return Dense(self.outputs)(hidden)
@@ -79,8 +85,7 @@ class PointHead(nn.Module):
     def __call__(self, features: Features, train: bool):
         """Features -> [B, N, outputs]."""
         first, second, _ = self.config.widths
-        hidden = _norm_relu(BlockDense(first, with_points=True)(features), train)
-        hidden = _norm_relu(Dense(second)(hidden), train)
+        hidden = _pointwise(features, first, second, True, train)
         hidden = nn.Dropout(self.config.dropout, deterministic=not train)(hidden)
         return Dense(self.outputs)(hidden)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -19,7 +20,10 @@ from caper_jax.networks.graph import (
     nearest_row,
     neighbour_max,
 )
-from caper_jax.networks.layers import BatchNorm, Dense, Weights
+from caper_jax.networks.layers import BatchNorm, Dense, Weights, weights_first
+
+# Reverse mode is all there is here anyway: the reductions over neighbours know no other.
+dense = partial(Dense, dot_general=weights_first)
 
 
 @dataclass(frozen=True)
@@ -63,8 +67,8 @@ class OutlierRobust(nn.Module):
         """features [B, N, C], around [B, N, k] neighbours in space -> [B, N, C]."""
         channels = features.shape[-1]
         shared = neighbour_max(features, around).mean(1, keepdims=True)
-        own = Dense(channels, use_bias=False, name="own")(features)
-        return features + own + Dense(channels, use_bias=False, name="shared")(shared)
+        own = dense(channels, use_bias=False, name="own")(features)
+        return features + own + dense(channels, use_bias=False, name="shared")(shared)
 
 
 class HSLayer(Weights, nn.Module):
@@ -98,16 +102,17 @@ class HSLayer(Weights, nn.Module):
         weights = weights / jnp.maximum(jnp.linalg.norm(weights, axis=0), 1e-12)
         toward = directions(points, scope)
         if features is None:
-            skip = Dense(self.channels, use_bias=False, name="skip")(points)
+            skip = dense(self.channels, use_bias=False, name="skip")(points)
             center: Any = 0.0
             active = directional_max(toward, scope, None, weights)
         else:
-            skip = Dense(self.channels, use_bias=False, name="skip")(features)
+            skip = dense(self.channels, use_bias=False, name="skip")(features)
             kernel = _uniform(bound)
-            dense = Dense(
+            supports = dense(
                 width + self.channels, kernel_init=kernel, bias_init=kernel, name="support"
             )(features)
-            center, support = dense[..., : self.channels], dense[..., self.channels :]
+            center = supports[..., : self.channels]
+            support = supports[..., self.channels :]
             active = directional_max(toward, scope, support, weights)
         active = active.reshape(*active.shape[:2], self.supports, self.channels).mean(2)
         return OutlierRobust(name="robust")(center + active, around) + skip

@@ -1,4 +1,5 @@
-"""Dense layer and batch norm of Flax, traced without evaluating their initialisers again.
+"""Dense layer and batch norm of Flax, traced without evaluating their initialisers again; and a
+product whose backward pass lets go of its input early.
 
 Flax compares every weight with its initialiser's output, traced anew, at each use. That is a third
 of the time to a first pose; the shape is an argument of the initialiser, and is compared here.
@@ -6,12 +7,50 @@ of the time to a first pose; the shape is an argument of the initialiser, and is
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
+from jax import lax
 
 from caper_jax.errors import CaperError
+
+
+def after(done: jax.Array, array: jax.Array) -> jax.Array:
+    """``array``, but not computed before ``done``, a number, is known; NaN unless that is finite.
+
+    XLA keeps no order between what does not depend on each other, and drops barriers on a CPU.
+    Meant for gradients, where one that is not finite makes all the others useless.
+    """
+    return jnp.where(jnp.isfinite(done), array, jnp.nan)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def weights_first(inputs, kernel, dimensions, precision=None):
+    """``lax.dot_general`` of [..., C] and [C, D] that backpropagates to the kernel first.
+
+    The inputs, often the largest arrays of a step, are then gone before the gradient goes on to
+    what they were computed from. In reverse mode only. For ``Dense(dot_general=...)``.
+    """
+    return lax.dot_general(inputs, kernel, dimensions, precision)
+
+
+def _weights_first_forward(inputs, kernel, dimensions, precision):
+    return weights_first(inputs, kernel, dimensions, precision), (inputs, kernel)
+
+
+def _weights_first_backward(dimensions, precision, residuals, cotangent):
+    inputs, kernel = residuals
+    rows = tuple(range(inputs.ndim - 1))
+    to_kernel = lax.dot_general(inputs, cotangent, ((rows, rows), ((), ())), precision)
+    last = ((cotangent.ndim - 1,), (1,))
+    to_inputs = lax.dot_general(cotangent, kernel, (last, ((), ())), precision)
+    return after(to_kernel[0, 0], to_inputs), to_kernel
+
+
+weights_first.defvjp(_weights_first_forward, _weights_first_backward)
 
 
 class Weights:

@@ -24,10 +24,12 @@ from caper_jax.networks.canonical import (
 )
 from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
 from caper_jax.networks.increment import increment_numbers, increment_transform
+from caper_jax.networks.layers import after
 from caper_jax.networks.turns import HALF_TURNS, NUM_TURNS, TURNS, turn_between, turned_pose
 from caper_jax.networks.voting import vote
 from caper_jax.training import losses
 from caper_jax.training.losses import HeatmapKind, LossWeights
+from caper_jax.training.staging import gradient_at_once
 
 
 @dataclass(frozen=True)
@@ -113,16 +115,23 @@ class Task:
         view = view_rotation(seen)
         points = rotate(view, batch.points) * unit
 
-        output, root_state = self._apply(
-            "root", params, model_state, rotate(view, seen) * unit, keys[0]
+        def stage_one(params, model_state, batch, view, cloud, key):
+            output, new_state = self._apply("root", params, model_state, cloud, key)
+            truth, labels, root_losses = self._choose_reading(batch, view, output)
+            total = losses.weighted_total(self.config.weights, root_losses).mean()
+            return total, (output, new_state, truth, labels, root_losses)
+
+        total, found, done = gradient_at_once(stage_one)(
+            params["root"], model_state, batch, view, rotate(view, seen) * unit, keys[0]
         )
-        truth, labels, root_losses = self._choose_reading(batch, view, output)
+        output, root_state, truth, labels, root_losses = found
+        points = after(done, points)  # stage I's activations are not needed any more
 
         reference, turn = self._noisy_root(keys[1], output, truth)
         if self.network.turn_width:
             reference, turn = self._turned(keys[3], reference, turn)
         canonical = canonicalise(points, reference[:, :3, :3], reference[:, :3, 3])
-        parts, parts_state = self._apply("parts", params, model_state, canonical, keys[2])
+        parts, parts_state = self._apply("parts", params["parts"], model_state, canonical, keys[2])
         stride = self.network.point_stride
         parts_losses, metrics = self._parts_losses(
             canonical[:, ::stride], parts, truth, labels[:, ::stride]
@@ -138,9 +147,7 @@ class Task:
         parts_losses["twist"] = increment_loss
         metrics["increment_deg"] = off
 
-        weights = self.config.weights
-        total = losses.weighted_total(weights, root_losses).mean()
-        total += losses.weighted_total(weights, parts_losses).mean()
+        total += losses.weighted_total(self.config.weights, parts_losses).mean()
         metrics |= {name: value.mean() for name, value in (root_losses | parts_losses).items()}
         error = so3.geodesic_distance(self._root_rotation(output), truth.rotation[:, 0])
         metrics["root_deg"] = jnp.degrees(jax.lax.stop_gradient(error)).mean()
@@ -155,7 +162,7 @@ class Task:
         sample, dropout = jax.random.split(key)
         state = {name: value[stage] for name, value in model_state.items()}
         return module.apply(
-            {"params": params[stage], **state},
+            {"params": params, **state},
             points,
             train=True,
             rngs={"sample": sample, "dropout": dropout},
