@@ -6,6 +6,7 @@ from functools import partial
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax.errors import FlaxError
@@ -54,3 +55,20 @@ def test_a_wrong_shape_is_named():
 def test_missing_weights_are_not_made_up():
     with pytest.raises(FlaxError):
         Ours().apply({"params": {}}, POINTS)
+
+
+def test_products_of_wide_layers_round_their_factors_where_asked_to():
+    rng = np.random.default_rng(2)
+    for width, rounded in ((3, False), (128, True)):
+        points = rng.normal(size=(50, width)).astype(np.float32)
+        layer = Dense(7)
+        variables = jax.jit(layer.init)(jax.random.key(0), points)
+        kernel = np.asarray(variables["params"]["kernel"])
+        plain = layer.apply(variables, points)
+        with jax.default_matmul_precision("bfloat16"):
+            found = layer.apply(variables, points)
+        factors = [a.astype(jnp.bfloat16).astype(np.float64) for a in (points, kernel)]
+        expected = factors[0] @ factors[1] if rounded else plain
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+        assert found.dtype == np.float32
+        assert (np.abs(found - plain).max() > 1e-4) == rounded

@@ -10,7 +10,7 @@ import flax.struct
 import jax.numpy as jnp
 
 from caper_jax.networks.graph import gather
-from caper_jax.networks.layers import Dense
+from caper_jax.networks.layers import Dense, product
 
 
 @flax.struct.dataclass
@@ -77,7 +77,7 @@ class BlockDense(nn.Module):
 
     width: int
     with_points: bool = False
-    dot_general: Any = None
+    dot_general: Any = product
 
     @nn.compact
     def __call__(self, features: Features):

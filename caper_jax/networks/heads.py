@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from caper_jax.networks.features import BlockDense, Features
-from caper_jax.networks.layers import BatchNorm, Dense, weights_first
+from caper_jax.networks.layers import BatchNorm, Dense, product, weights_first
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def _norm_relu(features, train: bool):
 
 def _pointwise(features: Features, first: int, second: int, with_points: bool, train: bool):
     """The two layers at every point, [B, N, second]."""
-    dot_general = weights_first if train else None
+    dot_general = weights_first if train else product
     hidden = BlockDense(first, with_points, dot_general)(features)
     return _norm_relu(Dense(second, dot_general=dot_general)(_norm_relu(hidden, train)), train)
 

@@ -29,6 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="clouds, may be repeated (default: 1 and 32; of paper 1)",
     )
     parser.add_argument(
+        "--bfloat16",
+        action="store_true",
+        help="also with factors rounded to bfloat16: how much faster, how far off",
+    )
+    parser.add_argument(
         "--repeats", type=common.positive_int, default=30, help="runs (default: %(default)s)"
     )
 
@@ -45,7 +50,7 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     ):
         for batch in arguments.batch or ((1, 32) if arguments.preset == "fast" else (1,)):
             measure = _fast if arguments.preset == "fast" else _paper
-            found = measure(name, batch, arguments.repeats)
+            found = measure(name, batch, arguments.repeats, arguments.bfloat16)
             rate = batch / found["seconds"]
             yield {
                 "category": name,
@@ -61,15 +66,29 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
             }
 
 
-def _fast(name: str, batch: int, repeats: int) -> dict[str, Any]:
+def _fast(name: str, batch: int, repeats: int, rounded: bool) -> dict[str, Any]:
+    import jax
+    import numpy as np
+
     from caper_jax.cli.benchmarks.models import clouds
     from caper_jax.estimator import load
+    from caper_jax.geometry import so3
 
     estimator = load(name)
     points = clouds(estimator.category, batch)
     call, cost = _call(estimator, points)
-    medians = timing.interleaved({"ours": call, "matmul": timing.matmul()}, repeats)
-    return {"seconds": medians["ours"], "matmul": medians["matmul"], "costs": cost, "more": {}}
+    calls, more = {"ours": call, "matmul": timing.matmul()}, {}
+    if rounded:
+        with jax.default_matmul_precision("bfloat16"):
+            calls["rounded"], _ = _call(estimator, points)
+        one, other = call().pose, calls["rounded"]().pose
+        turn = np.degrees(so3.geodesic_distance(one.rotation, other.rotation)).max()
+        shift = np.linalg.norm(one.translation - other.translation, axis=-1).max()
+        more = {"off_deg": round(float(turn), 3), "off_mm": round(1000 * float(shift), 3)}
+    medians = timing.interleaved(calls, repeats)
+    if rounded:
+        more["float32/bfloat16"] = round(medians["ours"] / medians["rounded"], 2)
+    return {"seconds": medians["ours"], "matmul": medians["matmul"], "costs": cost, "more": more}
 
 
 def _call(estimator: Any, points: Any) -> tuple[Callable[[], Any], costs.Costs]:
@@ -85,7 +104,7 @@ def _call(estimator: Any, points: Any) -> tuple[Callable[[], Any], costs.Costs]:
     return lambda: compiled(estimator.variables, resident), cost
 
 
-def _paper(name: str, batch: int, repeats: int) -> dict[str, Any]:
+def _paper(name: str, batch: int, repeats: int, rounded: bool) -> dict[str, Any]:
     import jax
     import numpy as np
 
@@ -107,28 +126,33 @@ def _paper(name: str, batch: int, repeats: int) -> dict[str, Any]:
         "naive": others_call,
         "matmul": timing.matmul(),
     }
+    if rounded:
+        with jax.default_matmul_precision("bfloat16"):
+            calls["rounded"], _ = _call(estimator, points)
     medians = timing.interleaved(calls, repeats)
 
     # Of stage I, whose outputs no decision separates from its weights.
     own = {name: collection["root"] for name, collection in estimator.variables.items()}
 
-    def outputs() -> Any:
+    def outputs() -> list[Any]:
         module = RootNetwork(network)
-        return jax.jit(lambda x: module.apply(own, x, train=False))(points * category.unit)
+        found = jax.jit(lambda x: module.apply(own, x, train=False))(points * category.unit)
+        return jax.tree.leaves(found)
 
-    found = jax.tree.leaves(outputs())
+    def off(one: list[Any], other: list[Any]) -> float:
+        pairs = zip(one, other, strict=True)
+        return max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs)
+
+    found = outputs()
     with naive.formulation():
-        others = jax.tree.leaves(outputs())
-    off = max(
-        float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(found, others, strict=True)
-    )
-    return {
-        "seconds": medians["ours"],
-        "matmul": medians["matmul"],
-        "costs": cost,
-        "more": {
-            "naive_ms": round(1000 * medians["naive"], 1),
-            "naive/ours": round(medians["naive"] / medians["ours"], 1),
-            "difference": off,
-        },
+        others = outputs()
+    more = {
+        "naive_ms": round(1000 * medians["naive"], 1),
+        "naive/ours": round(medians["naive"] / medians["ours"], 1),
+        "difference": off(found, others),
     }
+    if rounded:
+        with jax.default_matmul_precision("bfloat16"):
+            more["bfloat16_difference"] = off(outputs(), found)
+        more["float32/bfloat16"] = round(medians["ours"] / medians["rounded"], 2)
+    return {"seconds": medians["ours"], "matmul": medians["matmul"], "costs": cost, "more": more}
