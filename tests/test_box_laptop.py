@@ -117,36 +117,16 @@ def test_all_kinds_of_laptops_occur(laptops):
     assert min(bezels) < 0.004 and max(bezels) > 0.015
 
 
-def heights(solid, along_z):
-    """[2, n] lowest and highest y of a solid at x = 0 and each z, to 0.1 mm, by trying points."""
-    y = solid.center[1] + np.arange(-0.03, 0.03, 1e-4)
-    spots = np.stack(np.broadcast_arrays(0.0, y[:, None], along_z), -1)
-    filled = inside(solid, spots.reshape(-1, 3)).reshape(len(y), -1)
-    assert filled.any(0).all()
-    return y[filled.argmax(0)], y[::-1][filled[::-1].argmax(0)]
-
-
-def test_keyboards_lie_in_a_plane_level_or_sloping_to_the_front(laptops):
-    slopes = []
+def test_tops_of_laptops_are_level_at_any_body(laptops):
+    """Whatever the underside, the keyboard lies in one plane, in front of the hinge."""
     for model in laptops:
-        base, *others = model.parts[0]
+        base = model.parts[0][0]
         if base.kind != "frustum":
             continue
-        length = base.half[np.abs(base.rotation[2]).argmax()]
-        z = base.center[2] + np.array([0.8, 0.0, -0.8]) * length
-        bottom, top = heights(base, z)
-        np.testing.assert_allclose(top[1], top[[0, 2]].mean(), atol=2e-4)
-        slope = np.degrees(np.arctan2(top[2] - top[0], z[0] - z[2]))
-        assert slope > -0.1 and min(slope, np.ptp(bottom) * 100) < 0.1  # one of the two is level
-        slopes.append(slope)
-        keys = [
-            solid for solid in others if solid.kind == "box" and solid.center[1] > base.center[1]
-        ]
-        for key in keys[:3]:  # half sunk in the top, whatever its slope
-            middle = np.interp(key.center[2], z[::-1], top[::-1])
-            assert abs(key.center[1] - middle) < 0.0015
-    slopes = np.array(slopes)
-    assert 0.2 < (slopes > 0.3).mean() < 0.6 and 5 < slopes.max() < 9
+        top = bounds([base])[1][1]
+        low, high = bounds([base])
+        spots = np.array([[0, top - 1e-4, low[2] * f + high[2] * (1 - f)] for f in (0.1, 0.5, 0.9)])
+        assert inside(base, spots).all()
 
 
 @pytest.mark.parametrize("name", ["box", "laptop"])

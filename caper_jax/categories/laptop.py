@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from caper_jax.articulation.category import Category, Equivalence, Joint, ObjectModel
-from caper_jax.categories.forms import about, turned
+from caper_jax.categories.forms import about
 from caper_jax.geometry.solids import Solid, box, cylinder, frustum
 
 # Positive opens: the lid, above the hinge (+y) at rest, leans back (-z), which is about -x.
@@ -34,16 +34,16 @@ def _keyboard(rng: np.random.Generator, width: float, depth: float, top: float) 
 
 
 def _base(rng: np.random.Generator, width: float, depth: float, thickness: float) -> list[Solid]:
-    """The keyboard half: one of seven bodies, with keyboard and perhaps feet or a battery bulge."""
+    """The keyboard half: one of six bodies, with keyboard and perhaps feet or a battery bulge."""
     top = thickness / 2
     half = np.array([width, thickness, depth]) / 2
     body = rng.choice(
-        ["slab", "corners", "undercut", "teardrop", "sloped", "wedge", "rounded"],
-        p=[0.19, 0.2, 0.12, 0.1, 0.15, 0.09, 0.15],
+        ["slab", "corners", "undercut", "teardrop", "wedge", "rounded"],
+        p=[0.22, 0.23, 0.15, 0.12, 0.1, 0.18],
     )
     recess: Solid | None = None
     keyboard: list[Solid] = []
-    if rng.random() < 0.65 or body in ("undercut", "teardrop", "sloped"):
+    if rng.random() < 0.65 or body in ("undercut", "teardrop"):
         keyboard = _keyboard(rng, width, depth, top)
     elif rng.random() < 0.6:
         reach = rng.uniform(0.35, 0.5) * depth
@@ -63,15 +63,11 @@ def _base(rng: np.random.Generator, width: float, depth: float, thickness: float
     elif body == "undercut":  # smaller at the bottom
         taper = 1 - rng.uniform(0.5, 1.6) * thickness / np.array([width, depth])
         solids = [frustum((0, 0, 0), (half[0], half[2], half[1]), taper, _DOWN)]
-    elif body in ("teardrop", "sloped"):  # thin at the front: the top is level, or the bottom
-        thin = rng.uniform(0.3, 0.7) if body == "teardrop" else rng.uniform(0.1, 0.7)
-        up = 1 if body == "teardrop" else -1
-        half_slope = np.arctan2(thickness * (1 - thin) / 2, depth)
-        middle = (0, up * thickness * (1 - thin) / 4, 0)
-        solids = [frustum(middle, half, (1.0, thin), about("x", -up * half_slope))]
-        if body == "sloped":
-            tilt, edge = about("x", 2 * half_slope), (0.0, top, -depth / 2)
-            keyboard = [turned(key, tilt, edge) for key in keyboard]
+    elif body == "teardrop":  # thin at the front, its top level: turned by half the angle
+        thin = rng.uniform(0.3, 0.7)
+        slope = np.arctan2(thickness * (1 - thin) / 2, depth)
+        raised = (0, thickness * (1 - thin) / 4, 0)
+        solids = [frustum(raised, half, (1.0, thin), about("x", -slope))]
     elif body == "wedge":  # cut off from below towards the front
         rise = np.arctan2(thickness * rng.uniform(0.3, 0.6), depth)
         cut = box((0, -thickness, depth * 0.1), (width, thickness / 2, depth), about("x", -rise))
