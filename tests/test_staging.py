@@ -84,13 +84,11 @@ def test_one_stage_is_forgotten_before_the_next_begins():
     assert megabytes(staged, params) < 1.3 * alone
 
 
-def test_weights_first_is_a_product_with_its_gradients():
+@pytest.mark.parametrize(("wide", "narrow"), [(3, 4), (7, 2)], ids=["widening", "narrowing"])
+def test_weights_first_is_a_product_with_its_gradients(wide, narrow):
     rng = np.random.default_rng(1)
-    inputs, kernel, along = (
-        rng.normal(size=(2, 5, 3)),
-        rng.normal(size=(3, 4)),
-        rng.random((2, 5, 4)),
-    )
+    inputs, kernel = rng.normal(size=(2, 5, wide)), rng.normal(size=(wide, narrow))
+    along = rng.random((2, 5, narrow))
     dimensions = (((2,), (0,)), ((), ()))
     with jax.enable_x64(True):
         value, pull = jax.vjp(lambda x, k: weights_first(x, k, dimensions), inputs, kernel)

@@ -64,7 +64,11 @@ def _weights_first_forward(inputs, kernel, dimensions, precision):
 def _weights_first_backward(dimensions, precision, residuals, cotangent):
     inputs, kernel = residuals
     rows = tuple(range(inputs.ndim - 1))
-    to_kernel = lax.dot_general(inputs, cotangent, ((rows, rows), ((), ())), precision)
+    # A CPU transposes the first factor, which takes longer than the product: the narrower one.
+    wider = inputs.shape[-1] > cotangent.shape[-1]
+    factors = (cotangent, inputs) if wider else (inputs, cotangent)
+    to_kernel = lax.dot_general(*factors, ((rows, rows), ((), ())), precision)
+    to_kernel = to_kernel.T if wider else to_kernel
     last = ((cotangent.ndim - 1,), (1,))
     to_inputs = lax.dot_general(cotangent, kernel, (last, ((), ())), precision)
     return after(to_kernel[0, 0], to_inputs), to_kernel
