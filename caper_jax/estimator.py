@@ -226,13 +226,20 @@ class Estimator:
             clouds = points if points.ndim == 3 else points[None]
             prediction = self.function(self.variables, clouds)
         else:
-            prediction = self._jitted(self.variables, self._sampled(points))
+            prediction = self._jitted(self.variables, self.sampled(points))
         if np.ndim(points) == 3:
             return prediction
         return jax.tree.map(lambda array: array[0], prediction)
 
-    def _sampled(self, points) -> np.ndarray:
-        """[B, num_points, 3] float32 from one cloud or B clouds of any size."""
+    def sampled(self, points) -> np.ndarray:
+        """What the networks are given of points as ``__call__`` takes them, on the host.
+
+        Returns:
+          [B, num_points, 3] float32.
+
+        Raises:
+          CaperError: as ``__call__``.
+        """
         try:
             clouds = np.asarray(points)
         except ValueError as error:

@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from caper_jax import categories, cli
@@ -23,6 +24,7 @@ from caper_jax.cli import demo
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Prediction
 from caper_jax.visualization import scene as scenes
+from caper_jax.visualization.figures import save_figure
 from caper_jax.visualization.page import write_page
 from caper_jax.visualization.picture import write_picture
 from caper_jax.visualization.scene import Scene
@@ -255,6 +257,11 @@ def test_writing_needs_scenes_and_a_folder(tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(CaperError, match="cannot write"):
         write_page(tmp_path / "file" / "a.html", [arm_scene(truth=None)])
+    with pytest.raises(CaperError, match="cannot write"):
+        save_figure(Figure(), tmp_path / "file" / "a.png")
+    with pytest.raises(CaperError, match="a.nothing: Format"):
+        save_figure(Figure(), tmp_path / "a.nothing")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_demo_writes_pictures_and_a_page_and_prints_errors(tmp_path, monkeypatch, capsys):

@@ -91,10 +91,14 @@ def _is_writable(folder: Path) -> bool:
 
 def _machine() -> str:
     """Names the kind of processor: machine code for another one, in a shared home, would crash."""
-    facts = platform.machine() + platform.processor()
+    facts = platform.machine() + platform.processor() + cpu_fact("flags", "Features")
+    return hashlib.sha256(facts.encode()).hexdigest()[:12]
+
+
+def cpu_fact(*names: str) -> str:
+    """What Linux says of the processor under the first of these names it has, else ""."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        facts += next((line for line in lines if line.startswith(("flags", "Features"))), "")
     except OSError:
-        pass
-    return hashlib.sha256(facts.encode()).hexdigest()[:12]
+        return ""
+    return next((line.split(":", 1)[-1].strip() for line in lines if line.startswith(names)), "")

@@ -27,23 +27,22 @@ def after(done: jax.Array, array: jax.Array) -> jax.Array:
     return jnp.where(jnp.isfinite(done), array, jnp.nan)
 
 
-_BFLOAT16 = ("bfloat16", "BF16_BF16_F32")
 _WIDE = 64  # input channels, from which a product is worth rounding
 
 
 def product(inputs, kernel, dimensions, precision=None):
-    """``lax.dot_general`` that takes bfloat16 factors under ``jax.default_matmul_precision``.
+    """``lax.dot_general``, rounded under ``jax.default_matmul_precision("bfloat16")``.
 
-    JAX leaves that setting to the backend, and a CPU ignores it. Here "bfloat16" rounds the
-    factors of the wide layers on any backend; sums stay float32, and so do the first layers, whose
-    inputs are lengths and would be off by up to 0.4 %.
+    JAX leaves that setting to the backend, and a CPU ignores it. Here it rounds the factors of the
+    wide layers on any backend. Sums stay float32, and so do the factors of the first layers: they
+    are lengths, and would be off by up to 0.4 %.
     """
     chosen = jax.config.jax_default_matmul_precision  # type: ignore[attr-defined]
-    wide = kernel.shape[0] >= _WIDE and inputs.dtype == jnp.float32
-    if precision is None and wide and chosen in _BFLOAT16:
-        inputs, kernel = inputs.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16)
-        with jax.default_matmul_precision(None):
-            return lax.dot_general(inputs, kernel, dimensions, preferred_element_type=jnp.float32)
+    if precision is None and chosen == "bfloat16" and inputs.dtype == jnp.float32:
+        if kernel.shape[0] >= _WIDE:
+            factors = inputs.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16)
+            return lax.dot_general(*factors, dimensions, preferred_element_type=jnp.float32)
+        precision = lax.Precision.HIGHEST
     return lax.dot_general(inputs, kernel, dimensions, precision)
 
 

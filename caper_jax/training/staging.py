@@ -21,11 +21,12 @@ def gradient_at_once(function: Callable[..., tuple[jax.Array, PyTree]]) -> Calla
 
     Args:
       function: ``(params, *rest) -> (loss, aux)``; all that depends on anything differentiated
-        must come in by an argument. Differentiable with respect to ``params`` alone, once.
+        must come in by an argument.
 
     Returns:
-      ``(params, *rest) -> (loss, aux, done)``; ``done`` is a finite number that is known when the
-      gradient is. NaN or inf if a gradient is not finite; zero where no gradient is asked for.
+      ``(params, *rest) -> (loss, aux, done)``. Differentiable once, in reverse mode: the loss with
+      respect to ``params``; ``aux`` passes no gradient. ``done`` is a finite number, known when the
+      gradient is; NaN or inf if that is not finite, zero where none is asked for.
     """
 
     @jax.custom_vjp
@@ -36,12 +37,12 @@ def gradient_at_once(function: Callable[..., tuple[jax.Array, PyTree]]) -> Calla
     def forward(params: PyTree, *rest: PyTree):
         (loss, aux), gradient = jax.value_and_grad(function, has_aux=True)(params, *rest)
         done = sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(gradient))
-        return (loss, aux, done), (gradient, len(rest))
+        return (loss, aux, done), (gradient, [None] * len(rest))
 
-    def backward(residuals: tuple[PyTree, int], cotangents: tuple[jax.Array, PyTree, jax.Array]):
-        gradient, others = residuals
+    def backward(residuals: tuple[PyTree, list], cotangents: tuple[jax.Array, PyTree, jax.Array]):
+        gradient, no_gradients = residuals
         scaled = jax.tree.map(lambda leaf: cotangents[0] * leaf, gradient)
-        return scaled, *[None] * others
+        return scaled, *no_gradients
 
     value.defvjp(forward, backward)
     return value

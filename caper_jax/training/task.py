@@ -157,7 +157,7 @@ class Task:
         return total, (new_state, metrics)
 
     def _apply(self, stage: str, params, model_state, points, key):
-        """One stage in training mode: (output, its new mutable collections)."""
+        """One stage, with its own ``params``, in training mode: (output, new collections)."""
         module = self.root if stage == "root" else self.parts
         sample, dropout = jax.random.split(key)
         state = {name: value[stage] for name, value in model_state.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from caper_jax.evaluation.tables.render import Curves, Scatter
-from caper_jax.files import write_atomically
+from caper_jax.visualization.figures import save_figure
 
 _SIZE, _DPI = (8.0, 4.5), 120
 
@@ -33,7 +32,7 @@ def write_curves(path: Path, curves: Curves) -> None:
     axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def training_curves(title: str, rows: Sequence[dict[str, Any]]) -> Curves:
@@ -75,10 +74,4 @@ def write_scatter(path: Path, scatter: Scatter) -> None:
         axes.grid(alpha=0.3)
     figure.colorbar(drawn, ax=panels, label=scatter.colour_label, shrink=0.8)
     figure.suptitle(scatter.title)
-    _save(figure, path)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    write_atomically(path, buffer.getvalue())
+    save_figure(figure, path)

@@ -16,6 +16,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.data.synthetic.bank import build_bank, draw_models
 from caper_jax.data.synthetic.caster import cast, projected_bounds
 from caper_jax.data.synthetic.scene import draw_state_and_poses
+from caper_jax.visualization.figures import save_figure
 from caper_jax.visualization.scene import part_color
 
 TILE = 180  # pixels per side
@@ -58,8 +59,7 @@ def write_gallery(
         axes.set_axis_off()
         title = f"{category.name} ({', '.join(_parts(category))})"
         figure.text(8 / width, top + 4 / height, title, fontsize=10, va="bottom")
-    figure.savefig(path, dpi=_DPI)
-    return Path(path)
+    return save_figure(figure, path, dpi=_DPI)
 
 
 def _parts(category: Category) -> list[str]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from caper_jax.data.urdf.canonical import ImportedObject
 from caper_jax.data.urdf.render import PartCaster
-from caper_jax.errors import CaperError
+from caper_jax.visualization.figures import save_figure
 from caper_jax.visualization.scene import part_color
 
 PIXELS = 360
@@ -65,13 +65,7 @@ def write_model_check(path: str | Path, item: ImportedObject) -> Path:
     figure.legend(handles=handles, loc="lower center", ncols=4, fontsize=9, frameon=False)
     figure.suptitle(f"{item.category.name} {item.name}", fontsize=12)
     figure.subplots_adjust(left=0.01, right=0.99, top=0.86, bottom=0.14, wspace=0.03)
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path)
-    except OSError as error:
-        raise CaperError(f"{path}: cannot write the picture ({error.strerror})") from error
-    return path
+    return save_figure(figure, path)
 
 
 def _oblique() -> np.ndarray:

@@ -17,6 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.errors import CaperError
+from caper_jax.visualization.figures import save_figure
 from caper_jax.visualization.scene import (
     BOX_EDGES,
     NEAREST,
@@ -76,22 +77,7 @@ def write_picture(path: str | Path, scenes: Sequence[Scene]) -> Path:
         if row == 0:
             for axis, title in zip(axes, TITLES, strict=False):
                 axis.set_title(title, fontsize=12, color=INK, pad=8)
-    return save_figure(figure, path)
-
-
-def save_figure(figure: Figure, path: str | Path) -> Path:
-    """Writes a figure as PNG, and the folder it goes to.
-
-    Raises:
-      CaperError: a file that cannot be written.
-    """
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=DPI, facecolor="white")
-    except OSError as error:
-        raise CaperError(f"cannot write {path}: {error.strerror or error}") from error
-    return path
+    return save_figure(figure, path, dpi=DPI, facecolor="white")
 
 
 def _draw_input(axes: Axes, scene: Scene) -> None:

@@ -17,7 +17,8 @@ from matplotlib.ticker import MaxNLocator
 from caper_jax.articulation.category import Category
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.tracking import Track
-from caper_jax.visualization.picture import DPI, INK, PAPER, TRUTH, draw_estimate, save_figure
+from caper_jax.visualization.figures import save_figure
+from caper_jax.visualization.picture import DPI, INK, PAPER, TRUTH, draw_estimate
 from caper_jax.visualization.scene import Scene, format_state, joint_name, part_color
 
 MAX_TILES = 12
@@ -87,7 +88,7 @@ def write_sheet(path: str | Path, title: str, tiles: Sequence[Tile]) -> Path:
     heading = {"fontsize": 12, "fontweight": "bold", "color": INK, "parse_math": False}
     figure.suptitle(title, y=1 - 0.12 / height, va="top", **heading)
     _add_legend(figure, tiles[0].scene, any(tile.scene.truth is not None for tile in tiles))
-    return save_figure(figure, path)
+    return save_figure(figure, path, dpi=DPI, facecolor="white")
 
 
 def _draw_tile(axes: Axes, tile: Tile) -> None:
@@ -156,7 +157,7 @@ def write_states(
     axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     axes[0].set_title(track.name, fontsize=12, fontweight="bold", color=INK, parse_math=False)
     figure.subplots_adjust(left=0.09, right=0.78, top=0.93, bottom=0.6 / figure.get_figheight())
-    return save_figure(figure, path)
+    return save_figure(figure, path, dpi=DPI, facecolor="white")
 
 
 def _draw_states(axes: Axes, track: Track, category: Category, kind: str) -> None:

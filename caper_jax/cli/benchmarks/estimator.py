@@ -99,7 +99,7 @@ def _call(estimator: Any, points: Any) -> tuple[Callable[[], Any], costs.Costs]:
     compiled = lowered.compile()
     cost = costs.of(lowered, compiled)
     if len(points) == 1:
-        return lambda: compiled(estimator.variables, estimator._sampled(points)), cost
+        return lambda: compiled(estimator.variables, estimator.sampled(points)), cost
     resident = jax.device_put(points)
     return lambda: compiled(estimator.variables, resident), cost
 

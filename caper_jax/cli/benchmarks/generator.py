@@ -51,9 +51,8 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
             config = override(GeneratorConfig(instances=200, grid=grid), *arguments.set)
             generator = Generator(category, config)
             began = time.perf_counter()
-            lowered = generator._batch.lower(
-                keys[0], batch_size=arguments.batch, bank=generator.bank
-            )
+            draw = jax.jit(generator.draw, static_argnames="batch_size")
+            lowered = draw.lower(keys[0], batch_size=arguments.batch, bank=generator.bank)
             compiled = lowered.compile()
             compiling = time.perf_counter() - began
 

@@ -122,7 +122,7 @@ def _calls(name: str) -> tuple[Any, dict[str, Callable[[], Any]], dict[str, Call
     # Built outside of a network, the encoder needs no name: its weights lie at the top.
     encoder = make_encoder(network).clone(name=None)
     estimate = {
-        "sampling": lambda: estimator._sampled(raw),
+        "sampling": lambda: estimator.sampled(raw),
         "view": lambda: view(points),
         "root encoder": stage(encoder, "root", "encoder"),
         "root": stage(RootNetwork(network), "root"),
@@ -178,6 +178,8 @@ def _draw(path: Path, rows: Sequence[Mapping[str, Any]], category: str) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    from caper_jax.visualization.figures import save_figure
+
     chains = list(dict.fromkeys(row["chain"] for row in rows))
     figure = Figure(figsize=(9, 1.2 + 1.9 * len(chains)), layout="constrained")
     FigureCanvasAgg(figure)
@@ -193,5 +195,4 @@ def _draw(path: Path, rows: Sequence[Mapping[str, Any]], category: str) -> None:
         axes.margins(x=0.15)
         axes.tick_params(labelsize=8)
         axes.spines[["top", "right"]].set_visible(False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    save_figure(figure, path, dpi=100)

@@ -77,6 +77,8 @@ def _draw(path: Path, rows: Sequence[dict[str, Any]], preset: str) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    from caper_jax.visualization.figures import save_figure
+
     names = list(dict.fromkeys(row["varied"] for row in rows))
     figure = Figure(figsize=(3.6 * len(names), 5.2), layout="constrained")
     FigureCanvasAgg(figure)
@@ -105,5 +107,4 @@ def _draw(path: Path, rows: Sequence[dict[str, Any]], preset: str) -> None:
             axes.set_ylabel(label)
             axes.grid(alpha=0.3)
     figure.suptitle(f"estimator, {preset}: 1,024 points, 2 parts, batch 1 where not varied")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    save_figure(figure, path, dpi=100)

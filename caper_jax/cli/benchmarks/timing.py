@@ -8,8 +8,9 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
+
+from caper_jax.cli.cache import cpu_fact
 
 
 def seconds_of(call: Callable[[], Any]) -> float:
@@ -63,12 +64,7 @@ def elementwise() -> Callable[[], Any]:
 
 def processor() -> str:
     """What kind of processor this is, as the system calls it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    return next(named, platform.processor() or platform.machine())
+    return cpu_fact("model name") or platform.processor() or platform.machine()
 
 
 def load_average() -> float:
