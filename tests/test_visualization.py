@@ -259,7 +259,7 @@ def test_writing_needs_scenes_and_a_folder(tmp_path: Path):
         write_page(tmp_path / "file" / "a.html", [arm_scene(truth=None)])
     with pytest.raises(CaperError, match="cannot write"):
         save_figure(Figure(), tmp_path / "file" / "a.png")
-    with pytest.raises(CaperError, match="a.nothing: Format"):
+    with pytest.raises(CaperError, match=r"a\.nothing: Format"):
         save_figure(Figure(), tmp_path / "a.nothing")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
