@@ -193,6 +193,37 @@ class Changed:
         return dataclasses.replace(frame, **self._changes.get(index, {}))
 
 
+def test_the_worst_frames_are_named_and_drawn(path, tmp_path, monkeypatch, capsys):
+    """Of an estimator that turns one frame by 90 deg, two by 60, and is right on the rest."""
+    frames = Hdf5Dataset(path)
+    turns = {frames[7].name: 90.0, frames[3].name: 60.0, frames[11].name: 60.0}
+    known = [(protocol.cloud_of(f, 1024), f) for f in (frames[i] for i in range(FRAMES))]
+
+    class Estimator:
+        category, card = BOX, {}
+
+        def __call__(self, points):
+            clouds = points if points.ndim == 3 else points[None]
+            poses = [self.pose(cloud) for cloud in clouds]
+            pose = jax.tree.map(lambda *a: np.stack(a), *poses) if points.ndim == 3 else poses[0]
+            labels = np.zeros(points.shape[:-1], np.int32)
+            return types.SimpleNamespace(pose=pose, points=points, labels=labels)
+
+        def pose(self, cloud):
+            frame = next(f for other, f in known if np.array_equal(cloud, other))
+            turn = Rotation.from_euler("x", turns.get(frame.name, 0.0), degrees=True).as_matrix()
+            return frame.truth.replace(rotation=turn @ frame.truth.rotation)
+
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: Estimator())
+    assert run(path, tmp_path, "--worst", "2") == 0
+    lines = capsys.readouterr().out.split("largest errors of rotation:")[1].splitlines()
+    assert [line.split()[0] for line in lines[1:3]] == ["90.0", "60.0"]
+    assert lines[1].endswith(frames[7].name) and lines[2].endswith(frames[3].name)
+    assert "worst.png" in lines[-1] and (tmp_path / "worst.png").read_bytes()[:4] == b"\x89PNG"
+    assert run(path, tmp_path, "--worst", "2", "--predictor", "truth") == 2
+    assert "leave out --predictor" in capsys.readouterr().err
+
+
 def test_frames_that_fail_are_counted_not_dropped(path, tmp_path):
     dataset = Changed(Hdf5Dataset(path), {4: {"points": np.zeros((3, 3), np.float32)}})
     calls = []

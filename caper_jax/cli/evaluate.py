@@ -6,11 +6,18 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from caper_jax.cli import common
 from caper_jax.data import FORMATS
 from caper_jax.errors import CaperError
 
+if TYPE_CHECKING:
+    from caper_jax.data.schema import Dataset
+    from caper_jax.estimator import Estimator
+    from caper_jax.evaluation.protocol import Evaluation
+
+WORST_FILE = "worst.png"
 PREDICTORS = ("model", "truth", "mean")
 
 
@@ -22,6 +29,10 @@ def build_parser() -> argparse.ArgumentParser:
         [
             ("--category box --data ReArtMix --format reartmix --out outputs/box", "real frames"),
             ("--category box --data box_test.h5 --format caper --out outputs/box", "generated"),
+            (
+                "--category box --data box_test.h5 --format caper --worst 6 --out outputs/box",
+                "see why",
+            ),
         ],
     )
     parser.add_argument(
@@ -42,6 +53,12 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--limit", type=common.positive_int, help="at most so many frames, from the first"
+    )
+    parser.add_argument(
+        "--worst",
+        type=common.positive_int,
+        metavar="N",
+        help="also a picture of the N frames whose rotations are most off, worst.png",
     )
     common.add_object_scale(parser)
     parser.add_argument("--out", required=True, type=Path, help="folder for the results")
@@ -64,6 +81,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.split,
         arguments.official_split,
     )
+    if arguments.worst and arguments.predictor != "model":
+        raise CaperError("--worst shows what the model finds; leave out --predictor")
     weights = None
     predictor: protocol.Predictor = protocol.truth_predictor
     if arguments.predictor != "truth":
@@ -83,5 +102,57 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     report.write_report(arguments.out, evaluation, result)
     print(report.format_report(result))
-    print(f"\nwritten: {arguments.out / report.METRICS_FILE}, {report.PREDICTIONS_FILE}")
+    written = [report.METRICS_FILE, report.PREDICTIONS_FILE]
+    if arguments.worst:
+        _write_worst(arguments.out / WORST_FILE, dataset, estimator, evaluation, arguments.worst)
+        written.append(WORST_FILE)
+    print(f"\nwritten: {arguments.out / written[0]}, {', '.join(written[1:])}")
     return 0
+
+
+def _write_worst(
+    path: Path, dataset: Dataset, estimator: Estimator, evaluation: Evaluation, count: int
+) -> None:
+    """Draws the frames with the largest error of any part's rotation, and names them.
+
+    Raises:
+      CaperError: every frame failed, or the file cannot be written.
+    """
+    import jax
+    import numpy as np
+
+    from caper_jax.evaluation.protocol import NUM_POINTS, cloud_of
+    from caper_jax.geometry import so3
+    from caper_jax.visualization.picture import write_picture
+    from caper_jax.visualization.scene import Scene
+
+    found, truth = evaluation.estimate.rotation, evaluation.truth.rotation
+    off = np.degrees(so3.geodesic_distance(found, truth)).max(-1)
+    off = np.where(evaluation.failed, -1.0, off)
+    order = [
+        int(index)
+        for index in np.argsort(-off, kind="stable")[:count]
+        if not evaluation.failed[index]
+    ]
+    if not order:
+        raise CaperError("no frame to draw: the estimate of every one failed")
+    scenes = []
+    print("\nlargest errors of rotation:")
+    for index in order:
+        frame = dataset[index]
+        print(f"  {off[index]:6.1f} deg  {frame.name}")
+        seen = estimator(cloud_of(frame, NUM_POINTS))
+        scenes.append(
+            Scene(
+                name=frame.name,
+                category=dataset.category,
+                points=np.asarray(seen.points),
+                labels=np.asarray(seen.labels),
+                pose=jax.tree.map(np.asarray, seen.pose),
+                truth=frame.truth,
+                depth=frame.depth,
+                mask=frame.mask,
+                intrinsics=frame.intrinsics,
+            )
+        )
+    write_picture(path, scenes)

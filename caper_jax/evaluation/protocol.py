@@ -80,7 +80,7 @@ def evaluate(
         for start in range(0, count, batch_size):
             frames = [dataset[i] for i in range(start, min(start + batch_size, count))]
             padded = frames + [frames[-1]] * (batch_size - len(frames))
-            clouds = np.stack([_cloud(frame, num_points) for frame in padded])
+            clouds = np.stack([cloud_of(frame, num_points) for frame in padded])
             if not warm:
                 predictor(padded, clouds)
                 warm = True
@@ -165,8 +165,8 @@ def mean_predictor(category: Category, mean_pose: Mapping[str, Any], source: str
     return predict
 
 
-def _cloud(frame: Frame, num_points: int) -> np.ndarray:
-    """[N, 3]; for a frame that shows too little, some cloud, whose estimate is not used."""
+def cloud_of(frame: Frame, num_points: int) -> np.ndarray:
+    """[N, 3] points that a predictor sees; some cloud where the frame shows too little to use."""
     if len(frame.points) < MIN_POINTS:
         return np.linspace((-0.1, -0.1, 0.9), (0.1, 0.1, 1.1), num_points, dtype=np.float32)
     return sample_points(frame.points, num_points, where=frame.name).points
