@@ -160,6 +160,7 @@ class TestModel:
         assert cli.main([*command, "640"]) == 0
         estimator = load("box", folder)
         assert estimator.card["calibration"]["frames"] == 640
+        assert estimator.card["calibration"]["noise"] == ["none"]  # no camera to choose
         file = tmp_path / "box.h5"
         generate = ["generate", "--category", "box", "--split", "test", "--frames", "200"]
         generate += ["--grid", "16", "--points", "64", "--noise", "none", "--out", str(file)]

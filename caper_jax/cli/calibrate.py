@@ -23,7 +23,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--weights", required=True, type=Path, help="model directory; its model.json is rewritten"
     )
     parser.add_argument(
-        "--frames", type=common.positive_int, help="to fit on (default: 2048)", metavar="N"
+        "--frames", type=common.positive_int, help="to fit on (default: 4096)", metavar="N"
     )
     parser.add_argument(
         "--seed",

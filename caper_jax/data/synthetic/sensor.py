@@ -52,6 +52,7 @@ PRESETS: dict[str, Sensor] = {
     # D435: baseline 50 mm; noise z^2 * 0.08 px / (f B) with f = 640 px at 848 px width.
     "realsense": Sensor(0.0004, 0.0025, 0.5, 640.0 * 0.05, 1 / 32, 0.0, 0.3, 0.5, 0.15),
 }
+CAMERAS = ("kinect", "realsense")  # the presets that stand for what is sold
 
 
 def sensor_mix(names: tuple[str, ...]) -> Sensor:
