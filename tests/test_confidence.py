@@ -174,6 +174,15 @@ class TestModel:
             assert 0.8 < shares["0.9"] < 0.98, name
         assert (tmp_path / "reliability_box.png").stat().st_size > 1000
 
+    def test_calibration_leaves_clean_depth_out_where_there_are_cameras(self, folder, monkeypatch):
+        monkeypatch.setattr(jax, "jit", quick_jit)
+        mixed = dataclasses.replace(self.CONFIG, noise=("none", "kinect", "gauss3mm"))
+        found = calibration.calibrate(load("box", folder), mixed, 320)
+        alone = calibration.calibrate(
+            load("box", folder), dataclasses.replace(self.CONFIG, noise=("kinect",)), 320
+        )
+        assert found["noise"] == ["kinect"] and found == alone
+
     def test_object_scale_scales_lengths_only(self, monkeypatch):
         sizes = network()
         variables, card = random_variables(BOX, sizes), {"calibration": section()}

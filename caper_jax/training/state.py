@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import flax.struct
@@ -148,7 +148,8 @@ def make_step(
             return state, jax.tree.map(lambda x: x[None], metrics)
         return jax.lax.scan(lambda s, x: one(s, x[0], x[1], data), state, (progress, factor))
 
-    options = _compiler_options(jax.devices() if mesh is None else list(mesh.devices.flat))
+    device = jax.local_devices()[0] if mesh is None else mesh.devices.flat[0]
+    options = _compiler_options(device.platform)
     if mesh is None:
         return jax.jit(run, donate_argnums=0, compiler_options=options)
     everywhere = parallel.replicated(mesh)
@@ -165,13 +166,13 @@ def make_step(
 _LEAST_MEMORY = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 
 
-def _compiler_options(devices: Sequence[jax.Device]) -> dict[str, str] | None:
+def _compiler_options(platform: str) -> dict[str, str] | None:
     """On a CPU: an order of operations that holds little at once.
 
     XLA's default there runs ahead in all branches to have work for many cores; on two it takes
     longer (a step of the paper preset by an eighth) and up to half as much memory again.
     """
-    if devices[0].platform != "cpu":
+    if platform != "cpu":
         return None
     try:
         jax.jit(lambda: jnp.zeros(()), compiler_options=_LEAST_MEMORY)()
