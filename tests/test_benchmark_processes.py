@@ -31,7 +31,10 @@ def jobs(count, category="box"):
     cores = sorted(os.sched_getaffinity(0))
     coordinator = f"localhost:{processes._free_port()}"
     return [
-        worker.Job(category, "fast", 4, 3, count, rank, True, cores[rank % len(cores)], coordinator)
+        worker.Job(
+            *(category, "fast", 4, 3, count, rank, True, "local"),
+            *(cores[rank % len(cores)], coordinator),
+        )
         for rank in range(count)
     ]
 
@@ -42,27 +45,30 @@ def test_efficiency_is_the_rate_over_that_of_so_many_alone(monkeypatch):
             [{"step": 0.1}],
             [{"step": 0.1}, {"step": 0.2}],
             [{"step": 0.2, "all_reduce": 0.05, "reductions": 7}] * 2,
+            [{"step": 0.125, "all_reduce": 0.05, "reductions": 1}] * 2,
         ]
     )
     seen = []
 
     def perform(own, keep_programs):
-        seen.append([(job.batch, job.rank, job.core, job.together) for job in own])
+        seen.append([(job.batch, job.rank, job.core, job.together, job.batch_norm) for job in own])
         return next(found)
 
     monkeypatch.setattr(processes, "perform", perform)
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {9, 4, 5})
-    alone, apart, together = rows("--batch", "8")
+    alone, apart, together, local = rows("--batch", "8")
     assert seen == [
-        [(8, 0, 4, False)],
-        [(8, 0, 4, False), (8, 1, 5, False)],
-        [(8, 0, 4, True), (8, 1, 5, True)],
+        [(8, 0, 4, False, "global")],
+        [(8, 0, 4, False, "global"), (8, 1, 5, False, "global")],
+        [(8, 0, 4, True, "global"), (8, 1, 5, True, "global")],
+        [(8, 0, 4, True, "local"), (8, 1, 5, True, "local")],
     ]
     assert [row["samples_per_s"] for row in (alone, apart, together)] == [80, 120, 80]
     assert [row["efficiency_%"] for row in (alone, apart, together)] == [100, 75, 50]
     assert [row["step_ms"] for row in (alone, apart, together)] == [100, 200, 200]
     assert (apart["all_reduce_ms"], together["all_reduce_ms"]) == ("-", 50)
     assert together["all_reduces"] == 7
+    assert (local["efficiency_%"], local["all_reduces"]) == (80, 1)
 
 
 @pytest.mark.parametrize(
@@ -84,8 +90,8 @@ STAND_IN = """
     import jax, numpy as np
     from caper_jax.cli.benchmarks import costs, training, worker
 
-    def make(category, preset, batch, mesh):
-        assert batch == 8 and mesh.size == jax.process_count() == 2
+    def make(category, preset, batch, mesh, batch_norm):
+        assert batch == 8 and batch_norm == "local" and mesh.size == jax.process_count() == 2
         assert len(os.sched_getaffinity(0)) == 1
         shapes = {"w": jax.ShapeDtypeStruct((3, 2), np.float32)}
         call = lambda: time.sleep(0.01)
@@ -157,6 +163,8 @@ def test_the_model_on_paper(monkeypatch, capsys):
     assert many["norms_ms"] == pytest.approx(20 * 12 * 0.01)
     whole = 10 + many["all_reduce_ms"] + many["norms_ms"]
     assert many["efficiency_%"] == pytest.approx(1000 / whole, abs=0.1)
+    local = 1000 / (10 + many["all_reduce_ms"])
+    assert many["batch_norms_local_%"] == pytest.approx(local, abs=0.1)
 
     given = ["--model", "--preset", "paper", "--step-ms", "80"]
     assert cli.main(["benchmark", "processes", *given]) == 0

@@ -35,7 +35,7 @@ def batch_fn(key):
 def loss_fn(params, model_state, batch, key, progress):
     """A network with batch norm and noise: both couple or index the samples of a batch."""
     hidden = jnp.einsum("bnc,cd->bnd", batch["x"], params["in"]) + 0.1 * jax.random.normal(
-        key, (BATCH, 1, 8)
+        key, (len(batch["x"]), 1, 8)
     )
     mean = hidden.mean((0, 1))
     hidden = jnp.tanh((hidden - mean) / jnp.sqrt(hidden.var((0, 1)) + 1e-3))
@@ -65,13 +65,14 @@ def variables():
     }
 
 
-def train(mesh, steps):
+def train(mesh, steps, batch_norm="global"):
     """(state, metrics) after some steps on generated batches."""
     optimizer = Optimizer("ranger", learning_rate=0.02)
     sharding = parallel.one_device() if mesh is None else parallel.replicated(mesh)
     state = parallel.place(TrainState.create(variables(), optimizer, 3), sharding)
     ones = np.ones(steps, np.float32)
-    return make_step(loss_fn, optimizer, batch_fn=batch_fn, mesh=mesh)(state, ones, ones, None)
+    step = make_step(loss_fn, optimizer, batch_fn=batch_fn, mesh=mesh, batch_norm=batch_norm)
+    return step(state, ones, ones, None)
 
 
 def assert_close(got, wanted):
@@ -92,6 +93,45 @@ def test_eight_devices_equal_one():
     assert_close(eight, one)
     assert one_metrics["loss"][-1] != one_metrics["loss"][0]
     assert len(eight.params.fast["in"].sharding.device_set) == 8
+
+
+def test_local_batch_norm_is_the_mean_over_devices_that_see_their_own_rows_alone():
+    mesh = parallel.data_mesh()
+    gradient = jax.value_and_grad(loss_fn, has_aux=True)
+    start, key, now = variables(), jax.random.key(5), jnp.float32(0.0)
+    params, state = start.pop("params"), start
+    batch = batch_fn(jax.random.key(11))
+    rows = BATCH // mesh.size
+
+    def of_device(d):
+        own = {k: v[d * rows : (d + 1) * rows] if v.ndim else v for k, v in batch.items()}
+        return gradient(params, state, own, jax.random.fold_in(key, d), now)
+
+    each = [of_device(d) for d in range(mesh.size)]
+    wanted = jax.tree.map(lambda *values: np.mean(values, 0), *each)
+    compiled = (
+        jax.jit(parallel.each_device(gradient, mesh))
+        .lower(params, state, batch, key, now)
+        .compile()
+    )
+    assert compiled.as_text().count(" all-reduce(") == 1
+    assert_close(compiled(params, state, batch, key, now), wanted)
+    whole = gradient(params, state, batch, key, now)
+    assert abs(float(whole[0][0]) - float(wanted[0][0])) > 1e-3  # not what one device would see
+
+
+def test_a_step_with_local_batch_norm_learns_and_keeps_one_state_everywhere():
+    state, metrics = train(parallel.data_mesh(), 8, "local")
+    assert metrics["applied"].all() and metrics["loss"][-1] < metrics["loss"][0]
+    copies = [np.asarray(shard.data) for shard in state.params.fast["in"].addressable_shards]
+    assert len(copies) == 8
+    for copy in copies[1:]:
+        np.testing.assert_array_equal(copy, copies[0])
+
+
+def test_an_unknown_extent_of_batch_norm_is_refused():
+    with pytest.raises(CaperError, match=r"training.batch_norm must be 'global' or 'local', got"):
+        TrainingConfig(steps=1, batch_norm="sync")
 
 
 def test_generated_batches_are_split_and_do_not_depend_on_the_number_of_devices():

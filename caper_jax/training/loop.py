@@ -23,7 +23,7 @@ from caper_jax.training.metrics_log import FILE, MetricsLog
 from caper_jax.training.optimizer import Optimizer, OptimizerName, flat_and_anneal
 from caper_jax.training.run_directory import check_configuration
 from caper_jax.training.signals import StopRequest
-from caper_jax.training.state import LossFn, TrainState, make_step
+from caper_jax.training.state import BatchNormExtent, LossFn, TrainState, make_step
 
 PyTree = Any
 
@@ -48,6 +48,8 @@ class TrainingConfig:
       checkpoint_steps: steps between checkpoints, besides those by time; 0 for none.
       keep_checkpoints: newest checkpoints to keep.
       max_bad_steps: stop after so many steps without a finite gradient in a row.
+      batch_norm: over several devices: "global", as one device would train with the whole batch,
+        or "local", each on its own rows, which needs one sum per step (see `make_step`).
     """
 
     batch_size: int = 16
@@ -65,6 +67,7 @@ class TrainingConfig:
     checkpoint_steps: int = 0
     keep_checkpoints: int = 3
     max_bad_steps: int = 50
+    batch_norm: BatchNormExtent = "global"
 
     def __post_init__(self) -> None:
         if (self.steps is None) == (self.minutes is None):
@@ -88,6 +91,10 @@ class TrainingConfig:
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise CaperError(f"training.{name} must be positive, got {value}")
+        if self.batch_norm not in ("global", "local"):
+            raise CaperError(
+                f"training.batch_norm must be 'global' or 'local', got {self.batch_norm!r}"
+            )
         if not 0 <= self.seed < 2**32:
             raise CaperError(f"training.seed must be in 0..2**32 - 1, got {self.seed}")
         self.build_optimizer()  # checks its settings
@@ -157,7 +164,9 @@ def fit(
     check_configuration(directory, {"training": dataclasses.asdict(config), **(description or {})})
 
     optimizer = config.build_optimizer()
-    step_fn = make_step(loss_fn, optimizer, batch_fn=batch_fn, mesh=mesh)
+    step_fn = make_step(
+        loss_fn, optimizer, batch_fn=batch_fn, mesh=mesh, batch_norm=config.batch_norm
+    )
     sharding = parallel.replicated(mesh) if mesh is not None else parallel.one_device()
     state = parallel.place(TrainState.create(variables, optimizer, config.seed), sharding)
     if data is not None:

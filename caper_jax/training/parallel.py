@@ -1,17 +1,19 @@
 """Data parallelism over devices and processes: one mesh axis, replicated weights.
 
 A step compiled over a mesh computes what one device computes with the same global batch (batch
-norm included: its means run over the global batch). Random batches are drawn inside the step from
-the step's key; JAX's generator is partitionable, so they do not depend on the number of devices.
+norm included: its means run over the global batch), or, with ``each_device``, the mean of what each
+device computes on its own rows. Random batches are drawn inside the step from the step's key; JAX's
+generator is partitionable, so they do not depend on the number of devices.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from caper_jax.errors import CaperError
@@ -83,6 +85,37 @@ def constrain_batch(batch: PyTree, mesh: jax.sharding.Mesh) -> PyTree:
         return jax.lax.with_sharding_constraint(leaf, sharding)
 
     return jax.tree.map(constrain, batch)
+
+
+def each_device(function: Callable[..., PyTree], mesh: jax.sharding.Mesh) -> Callable[..., PyTree]:
+    """Inside jit: the mean over the mesh of what a function gives for each device's own rows.
+
+    Batch norm then sees one device's rows, and all that crosses between devices is one sum of the
+    results at the end, whatever the number of layers.
+
+    Args:
+      function: ``(params, model_state, batch, key, progress) -> floating-point arrays``. On each
+        device the batch is its rows (scalars are replicated) and the key one of its own.
+    """
+
+    def own(params: PyTree, model_state: PyTree, batch: PyTree, key: jax.Array, progress: PyTree):
+        key = jax.random.fold_in(key, jax.lax.axis_index(DATA_AXIS))
+        flat, unravel = ravel_pytree(function(params, model_state, batch, key, progress))
+        return unravel(jax.lax.pmean(flat, DATA_AXIS))
+
+    def mean(params: PyTree, model_state: PyTree, batch: PyTree, key: jax.Array, progress: PyTree):
+        everywhere = PartitionSpec()
+        rows = jax.tree.map(lambda x: PartitionSpec(DATA_AXIS) if x.ndim else everywhere, batch)
+        # Results are the same everywhere after the sum; custom gradients hide that from the check.
+        return jax.shard_map(
+            own,
+            mesh=mesh,
+            in_specs=(everywhere, everywhere, rows, everywhere, everywhere),
+            out_specs=everywhere,
+            check_vma=False,
+        )(params, model_state, batch, key, progress)
+
+    return mean
 
 
 def place(tree: PyTree, sharding: jax.sharding.Sharding) -> PyTree:

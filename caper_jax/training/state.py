@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import flax.struct
 import jax
@@ -21,6 +21,9 @@ LossFn = Callable[
     [PyTree, PyTree, PyTree, jax.Array, jax.Array],
     tuple[jax.Array, tuple[PyTree, dict[str, jax.Array]]],
 ]
+
+# The rows that means within a loss, batch norm's among them, run over: all, or one device's.
+BatchNormExtent = Literal["global", "local"]
 
 _DATA_STREAM, _LOSS_STREAM = 0, 1
 
@@ -87,6 +90,7 @@ def make_step(
     *,
     batch_fn: Callable[..., PyTree] | None = None,
     mesh: jax.sharding.Mesh | None = None,
+    batch_norm: BatchNormExtent = "global",
 ) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
     """Compile the training step.
 
@@ -102,6 +106,8 @@ def make_step(
         caller passes ``data``; every leaf leads with the batch axis. None: the caller passes a
         batch, used by each of the n steps.
       mesh: split the batch over this mesh's "data" axis; weights are replicated.
+      batch_norm: "global": over a mesh too the step is that of the whole batch on one device.
+        "local": losses, with the means in them, are those of each device's rows, averaged.
 
     Returns:
       ``run(state, progress, factor, data)``: the state is donated; ``data`` is the batch where
@@ -109,6 +115,10 @@ def make_step(
       Returns the new state and the metrics of each step: [n] arrays, among them "loss",
       "gradient_norm" (before clipping) and "applied".
     """
+
+    gradient = jax.value_and_grad(loss_fn, has_aux=True)
+    if mesh is not None and batch_norm == "local":
+        gradient = parallel.each_device(gradient, mesh)
 
     def one(state: TrainState, progress: jax.Array, factor: jax.Array, data: PyTree):
         data_key, loss_key = step_keys(state.seed, state.step)
@@ -120,7 +130,7 @@ def make_step(
             batch = parallel.constrain_batch(batch, mesh)
 
         weights = training_weights(state.params)
-        (loss, (model_state, metrics)), gradients = jax.value_and_grad(loss_fn, has_aux=True)(
+        (loss, (model_state, metrics)), gradients = gradient(
             weights, state.model_state, batch, loss_key, progress
         )
         norm = jnp.sqrt(sum(jnp.sum(jnp.square(g)) for g in jax.tree.leaves(gradients)))

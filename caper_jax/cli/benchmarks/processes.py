@@ -13,13 +13,16 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from caper_jax.cli import common
 from caper_jax.cli.benchmarks import cost_model, timing
 from caper_jax.cli.benchmarks.training import TARGETS
 from caper_jax.cli.benchmarks.worker import Job
 from caper_jax.errors import CaperError
+
+if TYPE_CHECKING:
+    from caper_jax.training.state import BatchNormExtent
 
 _PROCESSES = 2
 _WORKER = "caper_jax.cli.benchmarks.worker"
@@ -46,7 +49,8 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A training step in one process and in two, on CPU, each with a core and a batch of its own.
 
     Two that train apart share the machine and nothing else: what they lose is the machine's.
-    Together they also sum gradients and the statistics of batch norm.
+    Together they also sum gradients and, unless those are of each process's own batch, the
+    statistics of batch norm.
     """
     if arguments.model:
         yield from cost_model.run(arguments)
@@ -62,11 +66,13 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     size = arguments.batch or cost_model.batch_size(preset, arguments.category)
     gradients = cost_model.network(preset, arguments.category).gradient_bytes
     alone = None
-    for name, count, together in (
-        ("one process", 1, False),
-        ("two, apart", _PROCESSES, False),
-        ("two, together", _PROCESSES, True),
-    ):
+    settings: tuple[tuple[str, int, bool, BatchNormExtent], ...] = (
+        ("one process", 1, False, "global"),
+        ("two, apart", _PROCESSES, False, "global"),
+        ("two, together", _PROCESSES, True, "global"),
+        ("two, together, batch norms local", _PROCESSES, True, "local"),
+    )
+    for name, count, together, batch_norm in settings:
         coordinator = f"localhost:{_free_port()}"
         jobs = [
             Job(
@@ -77,6 +83,7 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 count,
                 rank,
                 together,
+                batch_norm,
                 core,
                 coordinator,
             )
@@ -87,7 +94,7 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
         alone = alone or rate
         reduction = found[0].get("all_reduce")
         yield {
-            "what": f"{name:<14}",
+            "what": f"{name:<32}",
             "batch_each": size,
             "samples_per_s": round(rate, 1),
             "step_ms": round(1000 * max(result["step"] for result in found), 1),

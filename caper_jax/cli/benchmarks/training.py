@@ -6,10 +6,13 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from caper_jax.cli import common
 from caper_jax.cli.benchmarks import costs, timing
+
+if TYPE_CHECKING:
+    from caper_jax.training.state import BatchNormExtent
 
 # Samples per second to reach on two CPU cores: fast per stage, paper with its best batch.
 TARGETS = {"fast": 150, "paper": 5}
@@ -90,7 +93,12 @@ class Step:
 
 
 def make(
-    category: str, preset: str, batch: int | None = None, count: int = 1, mesh: Any = None
+    category: str,
+    preset: str,
+    batch: int | None = None,
+    count: int = 1,
+    mesh: Any = None,
+    batch_norm: BatchNormExtent = "global",
 ) -> Step:
     """Compiles the step of a preset.
 
@@ -99,6 +107,7 @@ def make(
       batch: samples per step over all devices; by default the preset's.
       count: steps per call.
       mesh: devices that share the batch.
+      batch_norm: "global" or "local", see ``training.state.make_step``.
     """
     import jax
     import numpy as np
@@ -121,6 +130,7 @@ def make(
         optimizer,
         batch_fn=lambda key, bank: generator.draw(key, size, bank),
         mesh=mesh,
+        batch_norm=batch_norm,
     )
     variables = task.init(jax.random.key(0))
     gradients = jax.eval_shape(lambda: variables["params"])

@@ -7,7 +7,10 @@ import os
 import statistics
 import sys
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from caper_jax.training.state import BatchNormExtent
 
 
 @dataclass(frozen=True)
@@ -21,6 +24,7 @@ class Job:
       processes: that run at the same time.
       rank: of this one.
       together: whether they train one model; else each trains its own.
+      batch_norm: "global" or "local", of one model.
       core: that it runs on.
       coordinator: "host:port" of the first process.
     """
@@ -32,6 +36,7 @@ class Job:
     processes: int
     rank: int
     together: bool
+    batch_norm: BatchNormExtent
     core: int
     coordinator: str
 
@@ -45,7 +50,7 @@ def perform(job: Job) -> dict[str, Any]:
         parallel.initialize(job.coordinator, job.processes, job.rank)
     mesh = parallel.data_mesh() if job.together else None
     batch = job.batch * (job.processes if job.together else 1)
-    step = training.make(job.category, job.preset, batch, mesh=mesh)
+    step = training.make(job.category, job.preset, batch, mesh=mesh, batch_norm=job.batch_norm)
     timing.seconds_of(step.call)
     if job.processes > 1:
         parallel.agree([0.0])  # none begins while another compiles
