@@ -128,6 +128,11 @@ def test_sums_over_devices():
     assert float(total["b"]) == mesh.size
 
 
+def test_one_message_is_as_long_as_all_arrays():
+    shapes = {"a": jax.ShapeDtypeStruct((2, 3), np.float32), "b": jax.ShapeDtypeStruct((), "f4")}
+    assert worker._flat(shapes) == jax.ShapeDtypeStruct((7,), np.float32)
+
+
 @pytest.mark.parametrize(("devices", "seconds"), [(1, 0.0), (2, 1 + 2 * 0.5), (4, 1.5 + 6 * 0.5)])
 def test_a_ring(devices, seconds):
     """2 (n - 1) / n of the bytes, and a latency per turn."""

@@ -57,7 +57,8 @@ def perform(job: Job) -> dict[str, Any]:
     seconds = statistics.median(timing.seconds_of(step.call) for _ in range(job.repeats))
     if mesh is None:
         return {"step": seconds}
-    call = _all_reduce(step.gradients, mesh)
+    gradients = step.gradients if job.batch_norm == "global" else _flat(step.gradients)
+    call = _all_reduce(gradients, mesh)
     timing.seconds_of(call)
     alone = timing.median_seconds(lambda _: call(), max(job.repeats, 10))
     return {"step": seconds, "all_reduce": alone, "reductions": step.reductions}
@@ -82,6 +83,14 @@ def _all_reduce(shapes: Any, mesh: Any) -> Any:
         out_shardings=parallel.replicated(mesh),
     )
     return lambda: total(parts)
+
+
+def _flat(shapes: Any) -> Any:
+    """One vector as long as all arrays of these shapes."""
+    import jax
+
+    leaves = jax.tree.leaves(shapes)
+    return jax.ShapeDtypeStruct((sum(leaf.size for leaf in leaves),), leaves[0].dtype)
 
 
 def main(text: str) -> None:
