@@ -7,6 +7,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import flax.linen as nn
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -14,34 +15,16 @@ import numpy as np
 
 from caper_jax import categories, confidence
 from caper_jax.articulation.category import Category
-from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.confidence import Calibration
 from caper_jax.configuration import from_dict
 from caper_jax.data.cloud import MIN_POINTS, are_sampled, sample_points
 from caper_jax.errors import CaperError
-from caper_jax.geometry import se3
-from caper_jax.geometry.directions import rotation_from_directions
 from caper_jax.model_files import CARD_FILE, flatten, read_model
-from caper_jax.networks.canonical import (
-    canonicalise,
-    multiply,
-    rotate,
-    transpose,
-    view_rotation,
-)
-from caper_jax.networks.caper import (
-    NetworkConfig,
-    PartsNetwork,
-    RootNetwork,
-    shared_neighbourhoods,
-)
-from caper_jax.networks.increment import increment_transform
-from caper_jax.networks.turns import chosen_turn, turned_pose
-from caper_jax.networks.voting import vote
-
-# Part sizes are residuals to a mean; nothing else keeps a regression from going below zero.
-SMALLEST_SIZE = 0.01  # of the mean
+from caper_jax.networks.canonical import rotate, view_rotation
+from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
+from caper_jax.networks.sides import SidesNetwork, corrected, num_features
+from caper_jax.reading import articulated_pose, features_of, read
 
 
 @flax.struct.dataclass
@@ -89,7 +72,8 @@ def estimate(
     neighbours are not). vmap over stacked variables runs several models on one cloud.
 
     Args:
-      variables: {"params": {"root", "parts"}, "batch_stats": {...}} as trained.
+      variables: {"params": {"root", "parts"}, "batch_stats": {...}} as trained; with
+        ``network.sides_width`` also "sides" among "params".
       points: [B, N, 3] metres, camera frame, finite.
       category: static.
       network: static.
@@ -99,75 +83,31 @@ def estimate(
       Prediction with leading axis B and M = N.
     """
 
-    def apply(stage, module, cloud):
-        own = {name: collection[stage] for name, collection in variables.items()}
-        return module.apply(own, cloud, train=False, space=space)
-
-    unit = category.unit
     view = view_rotation(points)
-    cloud = rotate(view, points) * unit
-    space = shared_neighbourhoods(network, cloud)
-    root = apply("root", RootNetwork(network), cloud)
-    rotation, degenerate = rotation_from_directions(
-        root.directions[:, 0],
-        root.directions[:, 1],
-        root.confidence[:, 0],
-        root.confidence[:, 1],
-        category.directions,
-    )
-
-    pose = se3.from_rt(rotation, root.translation)
-    parts_network = PartsNetwork(network, category.num_parts)
-    uncorrected = pose
-    for _ in range(network.corrections):
-        canonical = canonicalise(cloud, pose[:, :3, :3], pose[:, :3, 3])
-        output = apply("parts", parts_network, canonical)
-        if output.turn is not None:
-            pose = turned_pose(pose, chosen_turn(output.turn, network.turn_margin))
-        pose = se3.compose(pose, increment_transform(output.increment, network.increment))
-    canonical = canonicalise(cloud, pose[:, :3, :3], pose[:, :3, 3])
-    parts = apply("parts", parts_network, canonical)
-    axis, pivot = vote(canonical, parts.heatmap, parts.offset, parts.direction)
-    state, pivot = parts.state / category.state_units, pivot / unit
-
-    back = transpose(view)
-    translation = rotate(back, pose[:, None, :3, 3])[:, 0] / unit
-    poses = forward_kinematics(
-        se3.from_rt(multiply(back, pose[:, :3, :3]), translation),
-        axis,
-        pivot,
-        state,
-        category.joint_types,
-        category.parents,
-    )
-    mean_size = jnp.asarray(category.mean_size)
-    articulated = ArticulatedPose(
-        rotation=poses[..., :3, :3],
-        translation=poses[..., :3, 3],
-        size=jnp.maximum(mean_size + parts.size / unit, SMALLEST_SIZE * mean_size),
-        box_center=jnp.asarray(category.mean_center) + parts.center / unit,
-        joint_axis=axis,
-        joint_pivot=pivot,
-        joint_state=state,
-    )
-    labels = parts.segmentation.argmax(-1).astype(jnp.int32)
-    corrected = se3.log(se3.compose(se3.inverse(uncorrected), pose))
-    found = confidence.evidence(root.confidence, corrected, parts.segmentation)
+    cloud = rotate(view, points) * category.unit
+    found = read(variables, cloud, category, network)
+    reading = found.reading
+    if network.sides_width:
+        module = SidesNetwork(network.sides_width, category.num_parts)
+        own = {"params": variables["params"]["sides"]}
+        output: Any = module.apply(own, features_of(found, cloud, category))
+        reading = corrected(reading, output)
+    labels = found.segmentation.argmax(-1).astype(jnp.int32)
     prediction = Prediction(
-        pose=articulated,
+        pose=articulated_pose(reading, view, category),
         points=points,
         labels=labels,
-        confidence=root.confidence,
-        degenerate=degenerate,
+        confidence=found.confidence,
+        degenerate=found.degenerate,
         seen=confidence.points_of_parts(labels, category.num_parts),
-        evidence=found,
+        evidence=found.evidence,
     )
     if calibration is None:
         return prediction
-    turn, shift, off = confidence.radii(calibration, found)
+    turn, shift, off = confidence.radii(calibration, found.evidence)
     return prediction.replace(  # type: ignore[attr-defined]
         rotation_std=turn / confidence.RADIUS_3D,
-        translation_std=shift / confidence.RADIUS_3D / unit,
+        translation_std=shift / confidence.RADIUS_3D / category.unit,
         state_std=off / confidence.RADIUS_1D / category.state_units,
     )
 
@@ -322,15 +262,22 @@ def load(category: str, weights: str | Path | None = None, object_scale: float =
 def _check_variables(directory: Path, variables, category: Category, network: NetworkConfig):
     """Raises CaperError unless the weights are those of the card's networks, leaf by leaf."""
     points = jax.ShapeDtypeStruct((2, network.num_points, 3), jnp.float32)
-    modules = {"root": RootNetwork(network), "parts": PartsNetwork(network, category.num_parts)}
+    parts = category.num_parts
+    modules: dict[str, tuple[nn.Module, Any, dict[str, Any]]] = {
+        "root": (RootNetwork(network), points, {"train": False}),
+        "parts": (PartsNetwork(network, parts), points, {"train": False}),
+    }
+    if network.sides_width:
+        features = jax.ShapeDtypeStruct((2, num_features(parts)), jnp.float32)
+        modules["sides"] = SidesNetwork(network.sides_width, parts), features, {}
     collections = ["params", "batch_stats"]
     try:
         # Without a key: drawing random weights takes longer to trace than the networks.
         shapes = {
-            name: jax.eval_shape(
-                partial(module.apply, train=False, mutable=collections), {}, points
-            )[1]
-            for name, module in modules.items()
+            name: jax.eval_shape(partial(module.apply, mutable=collections, **options), {}, inputs)[
+                1
+            ]
+            for name, (module, inputs, options) in modules.items()
         }
     except Exception as error:  # sizes that build no network; Flax and JAX raise many kinds
         reason = str(error).strip().splitlines()[0]

@@ -15,8 +15,12 @@ def build_parser() -> argparse.ArgumentParser:
         "calibrate",
         "Fits what a model says about its own errors (rotation_std, translation_std, state_std)\n"
         "on generated frames of instances that training never shows, and writes it into the\n"
-        "model's card. Training on generated frames does the same at its end.",
-        [("--category box --weights runs/box", "a model trained on data of your own")],
+        "model's card; with --sides first the network that corrects its estimates by the sides of\n"
+        "their boxes. Training on generated frames does both at its end.",
+        [
+            ("--category box --weights runs/box", "a model trained on data of your own"),
+            ("--category box --weights runs/box --sides", "and its sides"),
+        ],
     )
     parser.add_argument("--category", required=True, help="e.g. box, or FILE.py:NAME")
     parser.add_argument(
@@ -24,6 +28,14 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--frames", type=common.positive_int, help="to fit on (default: 4096)", metavar="N"
+    )
+    parser.add_argument(
+        "--sides",
+        type=common.positive_int,
+        nargs="?",
+        const=40_000,
+        metavar="N",
+        help="fit the sides first, on N frames (default: %(const)s)",
     )
     parser.add_argument(
         "--seed",
@@ -42,6 +54,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     from caper_jax.training.calibration import FRAMES, calibrate
     from caper_jax.training.run import TRAINING_DATA
 
+    if arguments.sides:
+        from caper_jax.networks.presets import PRESETS
+        from caper_jax.training.sides import add_sides
+
+        width = PRESETS["fast"].sides_width
+        options = (width, arguments.sides, arguments.seed)
+        add_sides(arguments.weights, arguments.category, TRAINING_DATA, *options)
     estimator = load(arguments.category, arguments.weights)
     frames = arguments.frames or FRAMES
     section = calibrate(estimator, TRAINING_DATA, frames, arguments.seed)

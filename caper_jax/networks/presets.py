@@ -15,6 +15,7 @@ PRESETS: dict[str, NetworkConfig] = {
         pooled_heads=HeadConfig(widths=(256, 256, 256), dropout=0.0, pool_first=True),
         point_heads=HeadConfig(widths=(64, 64, 64), dropout=0.0),
         turn_width=64,
+        sides_width=256,
         point_stride=4,
     ),
 }

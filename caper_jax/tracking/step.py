@@ -11,10 +11,10 @@ import jax.numpy as jnp
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.estimator import SMALLEST_SIZE
 from caper_jax.geometry import se3
 from caper_jax.networks.caper import NetworkConfig
 from caper_jax.networks.turns import NUM_TURNS
+from caper_jax.reading import SMALLEST_SIZE
 from caper_jax.tracking.config import TrackerConfig
 from caper_jax.tracking.energy import chamfer_energy
 from caper_jax.tracking.fix import Fix, averaged, diagonal, measure, misfit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -47,25 +48,13 @@ def calibrate(
     """
     if frames < 10 * _BATCH:
         raise CaperError(f"calibration needs {10 * _BATCH} frames or more, got {frames}")
-    rough = replace(
-        config,
-        instances=min(config.instances, frames),
-        num_points=estimator.network.num_points,
-        noise=tuple(name for name in config.noise if name in CAMERAS) or config.noise,
-    )
-    clean = GeneratorConfig(
-        instances=rough.instances, grid=rough.grid, num_points=rough.num_points, noise=rough.noise
-    )
-    generators = [Generator(estimator.category, one, SPLIT, seed) for one in (rough, clean)]
-    key = jax.random.key(seed)
+    cameras = tuple(name for name in config.noise if name in CAMERAS) or config.noise
+    config = replace(config, noise=cameras)
     measure = jax.jit(partial(_measure, estimator=estimator))
-    rows = []
-    with progress("calibrating", total=frames) as bar:
-        for start in range(0, frames, _BATCH):
-            generator = generators[start // _BATCH % 2]
-            batch = generator.batch(jax.random.fold_in(key, start), _BATCH)
-            rows.append(jax.tree.map(np.asarray, measure(estimator.variables, batch)))
-            bar.update(min(_BATCH, frames - start))
+    rows = [
+        jax.device_get(measure(estimator.variables, batch))
+        for batch in mixed_frames(estimator, config, SPLIT, frames, seed, "calibrating")
+    ]
     found, *errors = (np.concatenate(column)[:frames] for column in zip(*rows, strict=True))
     low, high = np.quantile(found, [0.01, 0.99], axis=(0, 1))
     inside = np.clip(found, low, high)
@@ -79,8 +68,38 @@ def calibrate(
     section = {"rotation": rotation, "translation": translation, "state": state}
     section |= {"low": low, "high": high}
     rounded = {name: np.round(np.asarray(value), 5).tolist() for name, value in section.items()}
-    data = {"frames": frames, "split": SPLIT, "seed": seed, "noise": list(rough.noise)}
+    data = {"frames": frames, "split": SPLIT, "seed": seed, "noise": list(cameras)}
     return {**rounded, "coverage": COVERAGE, **data}
+
+
+def mixed_frames(
+    estimator: Estimator, config: GeneratorConfig, split: str, frames: int, seed: int, title: str
+) -> Iterator[Batch]:
+    """Batches of generated frames, by turns as ``config`` has them and with sensors' noise alone.
+
+    Args:
+      estimator: whose category and number of points they have.
+      config: noise, and all else that frames may suffer from.
+      split: of the instances.
+      frames: at least so many.
+      seed: of shapes and frames.
+      title: of the progress display.
+    """
+    rough = replace(
+        config,
+        instances=min(config.instances, frames),
+        num_points=estimator.network.num_points,
+    )
+    clean = GeneratorConfig(
+        instances=rough.instances, grid=rough.grid, num_points=rough.num_points, noise=rough.noise
+    )
+    generators = [Generator(estimator.category, one, split, seed) for one in (rough, clean)]
+    key = jax.random.key(seed)
+    with progress(title, total=frames) as bar:
+        for start in range(0, frames, _BATCH):
+            generator = generators[start // _BATCH % 2]
+            yield generator.batch(jax.random.fold_in(key, start), _BATCH)
+            bar.update(min(_BATCH, frames - start))
 
 
 def quantile_regression(inputs: np.ndarray, target: np.ndarray, level: float = COVERAGE):

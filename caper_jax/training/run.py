@@ -22,11 +22,11 @@ from caper_jax.data import open_dataset
 from caper_jax.data.loader import LabelledClouds, Loader, LoaderConfig
 from caper_jax.data.synthetic.scene import Batch, Generator, GeneratorConfig
 from caper_jax.errors import CaperError, unknown_name
-from caper_jax.estimator import Estimator
+from caper_jax.estimator import load
 from caper_jax.model_files import flatten, read_model, unflatten, write_card, write_model
 from caper_jax.networks.caper import NetworkConfig
 from caper_jax.networks.presets import PRESETS as NETWORKS
-from caper_jax.training import parallel
+from caper_jax.training import parallel, sides
 from caper_jax.training.calibration import FRAMES, calibrate
 from caper_jax.training.loop import FitResult, TrainingConfig, fit
 from caper_jax.training.losses import LossWeights
@@ -62,6 +62,8 @@ class RunConfig:
       loader: a dataset to train on instead of generated frames.
       loss: weights and targets.
       training: optimiser and budget.
+      sides_frames: generated frames to fit ``network.sides_width`` on, see ``training.sides``; models
+        trained on a dataset have no such network.
       calibration_frames: generated frames to calibrate the trained model on, see
         ``training.calibration``; 0 for none. Models trained on a dataset are not calibrated.
     """
@@ -72,6 +74,7 @@ class RunConfig:
     loader: LoaderConfig | None = None
     loss: LossConfig = LossConfig()
     training: TrainingConfig = TrainingConfig(minutes=60.0)
+    sides_frames: int = sides.FRAMES
     calibration_frames: int = FRAMES
 
     def __post_init__(self) -> None:
@@ -145,15 +148,22 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         card = _card(config, result, draw_sample())
         if started_from is not None:
             card |= _with_origin(card, started_from)
-        variables = jax.device_get(result.state.variables)
-        write_model(directory, variables, card)
-        if config.loader is None and config.calibration_frames:
-            # Of the weights as they are stored, and once they are: it can be made up for.
-            card, variables = read_model(directory)
-            estimator = Estimator(category, config.network, variables, card)
-            arguments = (config.data, config.calibration_frames, config.training.seed)
-            write_card(directory, {**card, "calibration": calibrate(estimator, *arguments)})
+        write_model(directory, jax.device_get(result.state.variables), card)
+        if config.loader is None:  # of the weights as they are stored, and once they are
+            _finish(config, directory)
     return result
+
+
+def _finish(config: RunConfig, directory: str | Path) -> None:
+    """Adds to a model what is fitted on its own estimates: sides, then how wrong it is."""
+    seed = config.training.seed
+    if config.network.sides_width:
+        arguments = (config.network.sides_width, config.sides_frames, seed)
+        sides.add_sides(directory, config.category, config.data, *arguments)
+    if config.calibration_frames:
+        estimator = load(config.category, directory)
+        calibration = calibrate(estimator, config.data, config.calibration_frames, seed)
+        write_card(directory, {**estimator.card, "calibration": calibration})
 
 
 def _fit_generated(
@@ -215,9 +225,10 @@ def initial_variables(
 
     A model of another category gives its encoders only: outputs of its heads would begin with that
     category's conventions, and from an axis that points the other way no gradient leads back. A
-    model without a turn head gets a new one.
+    model without a turn head gets a new one. What was fitted on its estimates is left behind.
     """
     wanted, found = flatten(template), flatten(stored)
+    found = {name: leaf for name, leaf in found.items() if not name.startswith("params/sides/")}
     new = {name for name in wanted if "/turn/" in name} - found.keys()
     taken = [n for n in wanted if (same_category and n not in new) or "/encoder/" in n]
     fits = all(name in found and np.shape(found[name]) == np.shape(wanted[name]) for name in taken)
@@ -253,12 +264,13 @@ def mean_pose(batch: Batch | LabelledClouds) -> dict[str, Any]:
 
 
 def _card(config: RunConfig, result: FitResult, sample: Batch | LabelledClouds) -> dict[str, Any]:
-    """The model card: what was trained on what, where, and for how long."""
+    """The card of both stages: what was trained on what, where, and for how long."""
     state = result.state
+    stages = replace(config, network=replace(config.network, sides_width=0))
     return {
         "category": config.category,
         "version": __version__,
-        "run": to_dict(config),
+        "run": to_dict(stages),
         "steps": int(state.step),
         "samples": int(state.step) * config.training.batch_size,
         "skipped_steps": int(state.skipped),

@@ -38,7 +38,9 @@ def trained(
     config = override(training.preset(PRESET, category), *options.overrides, *changes)
     config = replace(
         config,
-        calibration_frames=0,  # nobody asks these models how sure they are
+        # What both stages find is compared, and nobody asks these models how sure they are.
+        network=replace(config.network, sides_width=0),
+        calibration_frames=0,
         training=replace(
             config.training,
             steps=options.steps,
