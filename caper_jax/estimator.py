@@ -23,8 +23,8 @@ from caper_jax.errors import CaperError
 from caper_jax.model_files import CARD_FILE, flatten, read_model
 from caper_jax.networks.canonical import rotate, view_rotation
 from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
-from caper_jax.networks.sides import SidesNetwork, corrected, num_features
-from caper_jax.reading import articulated_pose, features_of, read
+from caper_jax.networks.sides import SidesNetwork, num_features
+from caper_jax.reading import articulated_pose, read, readings
 
 
 @flax.struct.dataclass
@@ -86,12 +86,7 @@ def estimate(
     view = view_rotation(points)
     cloud = rotate(view, points) * category.unit
     found = read(variables, cloud, category, network)
-    reading = found.reading
-    if network.sides_width:
-        module = SidesNetwork(network.sides_width, category.num_parts)
-        own = {"params": variables["params"]["sides"]}
-        output: Any = module.apply(own, features_of(found, cloud, category))
-        reading = corrected(reading, output)
+    reading = readings(variables, found, cloud, category, network)[-1]
     labels = found.segmentation.argmax(-1).astype(jnp.int32)
     prediction = Prediction(
         pose=articulated_pose(reading, view, category),

@@ -22,7 +22,7 @@ from caper_jax.networks.caper import (
     shared_neighbourhoods,
 )
 from caper_jax.networks.increment import increment_transform
-from caper_jax.networks.sides import Reading, side_features
+from caper_jax.networks.sides import Reading, SidesNetwork, corrected, side_features
 from caper_jax.networks.turns import chosen_turn, turned_pose
 from caper_jax.networks.voting import vote
 
@@ -100,10 +100,31 @@ def read(variables: dict[str, Any], cloud, category: Category, network: NetworkC
     )
 
 
-def features_of(found: Found, cloud, category: Category):
-    """``sides.side_features`` [B, F] of what both stages found in a cloud."""
+def readings(
+    variables: dict[str, Any], found: Found, cloud, category: Category, network: NetworkConfig
+) -> list[Reading]:
+    """What both stages found, and what each pass over the sides of its boxes makes of it.
+
+    Args:
+      variables: see ``estimator.estimate``.
+      found: by ``read`` in this cloud.
+      cloud: [B, N, 3] viewing frame, network units.
+      category, network: static.
+    """
+    stages = [found.reading]
+    if network.sides_width:
+        module = SidesNetwork(network.sides_width, category.num_parts)
+        own = {"params": variables["params"]["sides"]}
+        for _ in range(network.sides_passes):
+            output: Any = module.apply(own, features_of(found, stages[-1], cloud, category))
+            stages.append(corrected(stages[-1], output))
+    return stages
+
+
+def features_of(found: Found, reading: Reading, cloud, category: Category):
+    """``sides.side_features`` [B, F] of a reading of a cloud in which both stages found this."""
     share = jax.nn.softmax(found.segmentation)
-    return side_features(found.reading, cloud, share, found.evidence[:, 0], category)
+    return side_features(reading, cloud, share, found.evidence[:, 0], category)
 
 
 def articulated_pose(reading: Reading, view, category: Category) -> ArticulatedPose:

@@ -44,6 +44,7 @@ class NetworkConfig:
       turn_margin: how many nats a turn must lead by before the estimator makes it.
       sides_width: channels of the network that corrects an estimate by the sides of its boxes (see
         ``networks.sides``), fitted once both stages are trained; 0: there is none.
+      sides_passes: how often it does so, each time from the last.
       rotation: what stage I regresses: "decoupled", two directions (Sec 5.1.1), or "quaternion",
         the whole rotation at once (the conventional method of Fig 11).
       vertical_correction: share what the two directions lack of a right angle by their confidence
@@ -66,6 +67,7 @@ class NetworkConfig:
     turn_width: int = 0
     turn_margin: float = 0.0
     sides_width: int = 0
+    sides_passes: int = 2
     rotation: Literal["decoupled", "quaternion"] = "decoupled"
     vertical_correction: bool = True
     joints: Literal["voting", "direct"] = "voting"

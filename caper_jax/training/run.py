@@ -62,8 +62,8 @@ class RunConfig:
       loader: a dataset to train on instead of generated frames.
       loss: weights and targets.
       training: optimiser and budget.
-      sides_frames: generated frames to fit ``network.sides_width`` on, see ``training.sides``; models
-        trained on a dataset have no such network.
+      sides_frames: generated frames to fit the network of ``sides_width`` channels on, see
+        ``training.sides``. Models trained on a dataset have none.
       calibration_frames: generated frames to calibrate the trained model on, see
         ``training.calibration``; 0 for none. Models trained on a dataset are not calibrated.
     """

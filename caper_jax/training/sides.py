@@ -6,6 +6,7 @@ is regressed on what the points say about their boxes, with the L1 losses of Eqs
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,10 @@ from caper_jax.estimator import Estimator, load
 from caper_jax.geometry import se3
 from caper_jax.model_files import read_model, write_model
 from caper_jax.networks.canonical import rotate, view_rotation
+from caper_jax.networks.caper import NetworkConfig
 from caper_jax.networks.sides import SidesNetwork, SidesOutput
 from caper_jax.progress import progress
-from caper_jax.reading import articulated_pose, features_of, read
+from caper_jax.reading import articulated_pose, features_of, read, readings
 from caper_jax.training.calibration import mixed_frames, nearer_reading
 
 FRAMES = 40_000
@@ -51,7 +53,7 @@ def fit_sides(
       config: what half of the frames look like; the others have the sensors' noise alone. Of
         other shapes than those that a run with the same seed was trained on.
       width: of the network.
-      frames: how many to fit on; the model reads each once.
+      frames: how many to fit on, besides a quarter of them for a first round.
       seed: of shapes, frames and weights.
 
     Raises:
@@ -59,11 +61,29 @@ def fit_sides(
     """
     if frames < 2 * _BATCH:
         raise CaperError(f"fitting sides needs {2 * _BATCH} frames or more, got {frames}")
-    measure = jax.jit(partial(_measure, estimator=estimator))
+    network = replace(estimator.network, sides_width=0)
+    first = _regressed(estimator, network, config, width, max(frames // 4, 2 * _BATCH), seed + 1)
+    # Then both what the stages find and what the first round makes of it.
+    params = {**estimator.variables["params"], "sides": first}
+    estimator = Estimator(estimator.category, network, {**estimator.variables, "params": params})
+    network = replace(network, sides_width=width, sides_passes=1)
+    return _regressed(estimator, network, config, width, frames, seed + 2)
+
+
+def _regressed(
+    estimator: Estimator,
+    network: NetworkConfig,
+    config: GeneratorConfig,
+    width: int,
+    frames: int,
+    seed: int,
+) -> dict[str, Any]:
+    """Weights regressed on what such a network finds, before and after its sides."""
+    measure = jax.jit(partial(_measure, category=estimator.category, network=network))
     rows = []
     title = "reading frames for sides"
-    for batch in mixed_frames(estimator, config, _SPLIT, frames, seed + 1, title):
-        rows.append(jax.device_get(measure(estimator.variables, batch)))
+    for batch in mixed_frames(estimator, config, _SPLIT, frames, seed, title):
+        rows += jax.device_get(measure(estimator.variables, batch))
     features, off, learn = (
         jax.tree.map(lambda *parts: np.concatenate(parts), *column)
         for column in zip(*rows, strict=True)
@@ -108,17 +128,20 @@ def add_sides(
     write_model(directory, {**variables, "params": params}, {**kept, "run": run, "sides": sides})
 
 
-def _measure(variables, batch: Batch, estimator: Estimator):
-    """(features [B, F], SidesOutput that would be right, whether to learn it [B])."""
-    category = estimator.category
+def _measure(variables, batch: Batch, category: Category, network: NetworkConfig):
+    """(features [B, F], SidesOutput that would be right, whether to learn it [B]) of every reading:
+    before and after each pass of the network's sides."""
     view = view_rotation(batch.points)
     cloud = rotate(view, batch.points) * category.unit
-    found = read(variables, cloud, category, estimator.network)
-    pose = articulated_pose(found.reading, view, category)
-    truth = nearer_reading(pose, batch.pose, category)
-    off = difference(pose, truth, category)
-    learn = jnp.linalg.norm(off.twist[:, :3], axis=-1) < _TURNED
-    return features_of(found, cloud, category), off, learn
+    found = read(variables, cloud, category, network)
+    rows = []
+    for reading in readings(variables, found, cloud, category, network):
+        pose = articulated_pose(reading, view, category)
+        truth = nearer_reading(pose, batch.pose, category)
+        off = difference(pose, truth, category)
+        learn = jnp.linalg.norm(off.twist[:, :3], axis=-1) < _TURNED
+        rows.append((features_of(found, reading, cloud, category), off, learn))
+    return rows
 
 
 def difference(pose: ArticulatedPose, truth: ArticulatedPose, category: Category) -> SidesOutput:
