@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -159,7 +160,10 @@ def _finish(config: RunConfig, directory: str | Path) -> None:
     seed = config.training.seed
     if config.network.sides_width:
         arguments = (config.network.sides_width, config.sides_frames, seed)
-        sides.add_sides(directory, config.category, config.data, *arguments)
+        try:
+            sides.add_sides(directory, config.category, config.data, *arguments)
+        except sides.TurnedModel as error:  # a short run: the model is usable as it is
+            print(f"sides are not fitted: {error}", file=sys.stderr)
     if config.calibration_frames:
         estimator = load(config.category, directory)
         calibration = calibrate(estimator, config.data, config.calibration_frames, seed)

@@ -43,6 +43,10 @@ _TURNED = np.radians(20.0)  # a root that is off by more lies in another box; no
 _WEIGHTS = SidesOutput(size=1.0, center=1.0, twist=4.0, pivot=2.0, state=2.0)
 
 
+class TurnedModel(CaperError):
+    """A model that is too wrong to be corrected by the sides of its boxes."""
+
+
 def fit_sides(
     estimator: Estimator, config: GeneratorConfig, width: int, frames: int = FRAMES, seed: int = 0
 ) -> dict[str, Any]:
@@ -57,7 +61,7 @@ def fit_sides(
       seed: of shapes, frames and weights.
 
     Raises:
-      CaperError: too few frames, or a model that is turned in nearly all of them.
+      CaperError: too few frames; TurnedModel, a model that is turned in nearly all of them.
     """
     if frames < 2 * _BATCH:
         raise CaperError(f"fitting sides needs {2 * _BATCH} frames or more, got {frames}")
@@ -89,7 +93,7 @@ def _regressed(
         for column in zip(*rows, strict=True)
     )
     if learn.mean() < 0.1:
-        raise CaperError(
+        raise TurnedModel(
             f"the root is turned by more than {np.degrees(_TURNED):.0f} deg in "
             f"{100 - 100 * learn.mean():.0f} % of {frames} frames: train the model longer before "
             "its sides are fitted, or set network.sides_width = 0"
