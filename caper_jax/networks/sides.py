@@ -153,16 +153,17 @@ def side_features(reading: Reading, cloud, share, evidence, category: Category):
 def _tilt(inside, share, side: float):
     """[B, K, 3, 4]: how many points are near one side along each axis, how far they are from it on
     average, and how that grows along the two other axes."""
-    near = share[..., None] * jnp.exp(-jnp.square((inside - side) / _BAND))
-    count = near.sum(1)
-    sure = count + 1e-3
-    shift = (near * (inside - side)).sum(1) / sure
+    # Points last: sums over them are then several times as fast on a CPU.
+    inside, share = jnp.moveaxis(inside, 1, -1), jnp.moveaxis(share, 1, -1)[:, :, None]
+    near = share * jnp.exp(-jnp.square((inside - side) / _BAND))  # [B, K, 3, N]
+    sure = near.sum(-1) + 1e-3
+    shift = (near * (inside - side)).sum(-1) / sure
     slopes = []
     for other in (1, 2):
-        along = jnp.roll(inside, -other, axis=-1)
-        along = along - ((near * along).sum(1) / sure)[:, None]
-        together = (near * (inside - side - shift[:, None]) * along).sum(1)
-        slopes.append(3.0 * together / ((near * jnp.square(along)).sum(1) + 0.02 * sure))
+        along = jnp.roll(inside, -other, axis=2)
+        along = along - ((near * along).sum(-1) / sure)[..., None]
+        together = (near * (inside - side - shift[..., None]) * along).sum(-1)
+        slopes.append(3.0 * together / ((near * jnp.square(along)).sum(-1) + 0.02 * sure))
     return jnp.stack([jnp.log(sure), shift, *slopes], axis=-1)
 
 
