@@ -33,9 +33,9 @@ def build_parser() -> argparse.ArgumentParser:
         "--sides",
         type=common.positive_int,
         nargs="?",
-        const=40_000,
+        const=True,
         metavar="N",
-        help="fit the sides first, on N frames (default: %(const)s)",
+        help="fit the sides first, on N frames (default: 40000)",
     )
     parser.add_argument(
         "--seed",
@@ -56,11 +56,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     if arguments.sides:
         from caper_jax.networks.presets import PRESETS
-        from caper_jax.training.sides import add_sides
+        from caper_jax.training import sides
 
-        width = PRESETS["fast"].sides_width
-        options = (width, arguments.sides, arguments.seed)
-        add_sides(arguments.weights, arguments.category, TRAINING_DATA, *options)
+        number = sides.FRAMES if arguments.sides is True else arguments.sides
+        options = (PRESETS["fast"].sides_width, number, arguments.seed)
+        sides.add_sides(arguments.weights, arguments.category, TRAINING_DATA, *options)
     estimator = load(arguments.category, arguments.weights)
     frames = arguments.frames or FRAMES
     section = calibrate(estimator, TRAINING_DATA, frames, arguments.seed)

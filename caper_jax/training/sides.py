@@ -23,7 +23,7 @@ from caper_jax.data.synthetic.scene import Batch
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load
 from caper_jax.geometry import se3
-from caper_jax.model_files import read_model, write_model
+from caper_jax.model_files import write_model
 from caper_jax.networks.canonical import rotate, view_rotation
 from caper_jax.networks.caper import NetworkConfig
 from caper_jax.networks.sides import SidesNetwork, SidesOutput
@@ -38,7 +38,7 @@ _STEPS = 6000
 _PER_CALL = 100  # steps compiled into one call
 _RATE = 2e-3
 _DECAY = 1e-3
-_DROPOUT = 0.1  # of features and of hidden channels: frames are few
+_DROPOUT = 0.1  # of features: frames are few
 _TURNED = np.radians(20.0)  # a root that is off by more lies in another box; nothing to learn
 _WEIGHTS = SidesOutput(size=1.0, center=1.0, twist=4.0, pivot=2.0, state=2.0)
 
@@ -123,7 +123,7 @@ def add_sides(
       CaperError: see ``fit_sides`` and ``estimator.load``; the model is left as it was.
     """
     estimator = load(category, directory)
-    card, variables = read_model(directory)
+    card, variables = estimator.card, estimator.variables
     fitted = fit_sides(estimator, config, width, frames, seed)
     params = {**variables["params"], "sides": fitted}
     run = {**card["run"], "network": {**card["run"]["network"], "sides_width": width}}
