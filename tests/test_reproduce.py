@@ -274,9 +274,9 @@ class TestStatic:
 
     def test_frames_are_those_of_generate_and_drawn_once(self, tmp_path, monkeypatch):
         small = dataclasses.replace(SMALL, num_points=64, measure_visibility=True)
-        monkeypatch.setattr(frames_of_tables, "FRAME_DATA", small)
         monkeypatch.setattr(jax, "jit", quick_jit)
-        first, description = frames_of_tables.generated_frames(tmp_path, LAPTOP, 3)
+        draw = partial(frames_of_tables.generated_frames, tmp_path, LAPTOP, 3, config=small)
+        first, description = draw()
         assert "3 generated frames, noise none, seed 0, of 3 test instances" in description
         file = tmp_path / "own.h5"
         generate = ["generate", "--category", "laptop", "--frames", "3", "--instances", "3"]
@@ -287,7 +287,7 @@ class TestStatic:
             assert mine.name == other.name
             np.testing.assert_array_equal(mine.points, other.points)
         monkeypatch.setattr(frames_of_tables, "collect_frames", None)  # would be called in vain
-        again, _ = frames_of_tables.generated_frames(tmp_path, LAPTOP, 3)
+        again, _ = draw()
         np.testing.assert_array_equal(again[2].points, first[2].points)
 
 
@@ -323,8 +323,10 @@ class TestModels:
         monkeypatch.setattr(runs, "config_for", lambda _: config)
         monkeypatch.setattr(jax, "jit", quick_jit)
         options = ["--weights", str(folder), "--network-alone", "--seed", "5", "--videos", "7"]
+        options += ["--noise", "none"]
         assert run("jitter", tmp_path, *options) == 0
-        assert asked == [(tmp_path / "videos", LAPTOP, "still", 7, 30, 5)]
+        clean = dataclasses.replace(videos.TEST_DATA, noise=("none",))
+        assert asked == [(tmp_path / "videos", LAPTOP, "still", 7, 30, 5, clean)]
         output = capsys.readouterr().out
         for label in ("given", "estimated"):
             row = cells(output, "laptop", "base", label)
@@ -357,7 +359,7 @@ def test_generated_videos_are_drawn_once(tmp_path, monkeypatch):
     draw()
     with pytest.raises(CaperError, match=r"seed1\.h5: no such file"):
         draw(seed=1)
-    names = [f"laptop_still_3x4x64_seed{seed}.h5" for seed in (0, 1)]
+    names = [f"laptop_still_none_3x4x64_seed{seed}.h5" for seed in (0, 1)]
     assert [path.name for path in drawn] == names
 
 
@@ -527,6 +529,11 @@ class TestIncrements:
         (["table2", "--category", "box", "--data", "x"], "--data needs --format"),
         (["table2", "--category", "box", "--split", "train"], "--split goes with --data"),
         (["table4", "--category", "box", "--split", "train"], "--split goes with --data"),
+        (["table3", "--noise", "fog"], "unknown data.noise entry 'fog'"),
+        (
+            ["table2", "--noise", "none", "--data", ".", "--format", "reartmix"],
+            "--noise is of generated depth",
+        ),
         (
             ["table4", "--category", "box", "--data", "x", "--format", "caper", "--mode", "cam"],
             "--mode is of generated videos",

@@ -18,14 +18,17 @@ if TYPE_CHECKING:
 
 _TRACKING = (
     *("category", "videos", "frames", "mode", "data", "format", "split", "weights", "seed"),
-    *("network_alone", "object_scale"),
+    *("noise", "network_alone", "object_scale"),
 )
-_STATIC = ("category", "frames", "data", "format", "split", "weights", "seed", "object_scale")
+_STATIC = (
+    *("category", "frames", "data", "format", "split", "weights", "seed", "noise"),
+    "object_scale",
+)
 _TRAINED = (
-    *("category", "frames", "data", "format", "split", "seed"),
+    *("category", "frames", "data", "format", "split", "seed", "noise"),
     *("seeds", "minutes", "steps", "initial", "overrides"),
 )
-_MOVING = ("category", "videos", "frames", "weights", "seed", "network_alone")
+_MOVING = ("category", "videos", "frames", "weights", "seed", "noise", "network_alone")
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ REPRODUCTIONS = {
         "increments",
         "Lie against Euclidean increments; trains both",
         (
-            *("category", "videos", "frames", "mode", "data", "format", "split", "seed"),
+            *("category", "videos", "frames", "mode", "data", "format", "split", "seed", "noise"),
             *("seeds", "minutes", "steps", "initial", "overrides"),
         ),
     ),
@@ -138,6 +141,10 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
             "help": "of generated frames and videos (default: %(default)s)",
         },
     ),
+    "noise": (
+        "--noise",
+        {"help": "of generated depth: none, gauss3mm, kinect or realsense (default: kinect)"},
+    ),
     "given_masks": (
         "--given-masks",
         {"action": "store_true", "help": "add rows with the data's part labels"},
@@ -193,6 +200,7 @@ def build_parser() -> argparse.ArgumentParser:
         [
             ("table1", "single frames, all categories of the table"),
             ("table1 --data ROOT --format artimage --object-scale 3.7", "on the paper's data"),
+            ("table1 --noise none", "on clean depth, as the paper's ArtImage is rendered"),
             ("table6 --category laptop", "one category, on generated videos"),
             ("table6 --data PM-Videos --format pm-videos", "on the paper's data"),
             ("table10 --weights runs/arm --frames 1000", "errors against frame, long videos"),

@@ -11,6 +11,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.data import categories_in, open_dataset
 from caper_jax.data.schema import Dataset
 from caper_jax.data.synthetic.collect import collect_frames
+from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.data.synthetic.scene import Generator
 from caper_jax.evaluation.tables.options import SPLIT, Options
 from caper_jax.evaluation.tables.videos import TEST_DATA, fingerprint, kept_file
@@ -33,7 +34,7 @@ def open_frames(options: Options, category: Category, frames: int) -> tuple[Data
     source = options.dataset()
     if source is None:
         folder, count = options.out / "frames", options.frames or frames
-        return generated_frames(folder, category, count, options.seed)
+        return generated_frames(folder, category, count, options.seed, options.drawn(FRAME_DATA))
     format, root, split = source
     if category.name not in categories_in(format, root):
         return None
@@ -43,7 +44,11 @@ def open_frames(options: Options, category: Category, frames: int) -> tuple[Data
 
 
 def generated_frames(
-    folder: Path, category: Category, frames: int, seed: int = 0
+    folder: Path,
+    category: Category,
+    frames: int,
+    seed: int = 0,
+    config: GeneratorConfig = FRAME_DATA,
 ) -> tuple[Dataset, str]:
     """Frames of test instances; those of an earlier call with the same arguments are read again.
 
@@ -52,11 +57,12 @@ def generated_frames(
       category: has procedural shapes.
       frames: how many.
       seed: of shapes and frames.
+      config: what the frames look like.
 
     Raises:
       CaperError: see ``Generator``; a damaged file.
     """
-    config, (noise,) = FRAME_DATA, FRAME_DATA.noise
+    noise = ",".join(config.noise)
     generator = Generator(category, config, SPLIT, seed)
     attributes: dict[str, Any] = {
         "generator": __version__,
@@ -71,7 +77,7 @@ def generated_frames(
         title = f"generating {category.name} frames"
         return collect_frames(generator, seed, frames, title=title)
 
-    path = folder / f"{category.name}_{frames}x{config.num_points}_seed{seed}.h5"
+    path = folder / f"{category.name}_{noise}_{frames}x{config.num_points}_seed{seed}.h5"
     description = (
         f"{frames} generated frames, noise {noise}, seed {seed}, of {config.instances} test "
         "instances, which training never shows"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.errors import CaperError, unknown_name
 
 SPLIT = "test"
@@ -25,6 +26,7 @@ class Options:
       weights: a model directory, or a folder with one per category.
       object_scale: see ``estimator.load``.
       seed: of the generated frames or videos.
+      noise: of their depth, a preset of ``data.synthetic.sensor``.
       given_masks: add runs with the data's part labels.
       network_alone: track by the network's increment, without registration.
       seeds: runs to train of each kind.
@@ -44,6 +46,7 @@ class Options:
     weights: Path | None = None
     object_scale: float = 1.0
     seed: int = 0
+    noise: str | None = None
     given_masks: bool = False
     network_alone: bool = False
     seeds: int = 3
@@ -64,11 +67,15 @@ class Options:
                 raise unknown_name("category of this table", name, known)
         return [name for name in known if name in self.category or not self.category]
 
+    def drawn(self, config: GeneratorConfig) -> GeneratorConfig:
+        """What generated frames look like: as in ``config``, but for what is asked for here."""
+        return config if self.noise is None else replace(config, noise=(self.noise,))
+
     def dataset(self) -> tuple[str, Path, str] | None:
         """(format, root, split) of the data set to measure on; None for generated data.
 
         Raises:
-          CaperError: a format or split without data, or data without a format.
+          CaperError: a format or split without data, data without a format, noise with data.
         """
         if self.data is None:
             for name in ("format", "split"):
@@ -77,4 +84,6 @@ class Options:
             return None
         if self.format is None:
             raise CaperError("--data needs --format, the layout of the data")
+        if self.noise is not None:
+            raise CaperError("--noise is of generated depth; leave out --data or --noise")
         return self.format, self.data, self.split or SPLIT

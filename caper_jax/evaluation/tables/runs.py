@@ -15,7 +15,7 @@ from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load, shipped_weights
 from caper_jax.evaluation.metrics import object_diagonal, pose_errors_up_to_symmetry
 from caper_jax.evaluation.tables.options import Options
-from caper_jax.evaluation.tables.videos import Videos, dataset_videos, generated_videos
+from caper_jax.evaluation.tables.videos import TEST_DATA, Videos, dataset_videos, generated_videos
 from caper_jax.evaluation.tracking import (
     Start,
     Track,
@@ -154,6 +154,7 @@ def open_videos(
             options.videos or videos,
             options.frames or frames,
             options.seed,
+            options.drawn(TEST_DATA),
         )
     for name in ("mode", "frames"):
         if getattr(options, name) is not None:

@@ -81,7 +81,8 @@ def generated_videos(
         "shapes": fingerprint(generator.bank),
     }
     points = config.num_points
-    path = folder / f"{category.name}_{mode}_{videos}x{frames}x{points}_seed{seed}.h5"
+    length = f"{videos}x{frames}x{points}"
+    path = folder / f"{category.name}_{mode}_{noise}_{length}_seed{seed}.h5"
 
     def draw() -> dict[str, Any]:
         title = f"generating {category.name} videos"
