@@ -19,6 +19,7 @@ ESTIMATOR = {
     "stage I: heads": ("root", "root encoder"),
     "stage II, twice: encoder": ("parts encoder",),
     "stage II, twice: heads": ("parts", "parts encoder"),
+    "sides of boxes": ("networks", "networks without sides"),
 }
 TRACKER = {
     "sampling": ("sampling",),
@@ -91,7 +92,7 @@ def _calls(name: str) -> tuple[Any, dict[str, Callable[[], Any]], dict[str, Call
 
     from caper_jax.cli.benchmarks.models import clouds
     from caper_jax.data.cloud import sample_points
-    from caper_jax.estimator import load
+    from caper_jax.estimator import estimate, load
     from caper_jax.networks.canonical import rotate, view_rotation
     from caper_jax.networks.caper import PartsNetwork, RootNetwork, make_encoder
     from caper_jax.tracker import Tracker, config_for
@@ -103,6 +104,10 @@ def _calls(name: str) -> tuple[Any, dict[str, Callable[[], Any]], dict[str, Call
     raw = clouds(category, 1, _POINTS)[0]
     points = jax.device_put(sample_points(raw, network.num_points).points[None])
     unit = category.unit
+    bare = dataclasses.replace(network, sides_width=0)
+    networks, without_sides = (
+        jax.jit(partial(estimate, category=category, network=config)) for config in (network, bare)
+    )
 
     @jax.jit
     def view(x: Any) -> Any:
@@ -121,13 +126,15 @@ def _calls(name: str) -> tuple[Any, dict[str, Callable[[], Any]], dict[str, Call
 
     # Built outside of a network, the encoder needs no name: its weights lie at the top.
     encoder = make_encoder(network).clone(name=None)
-    estimate = {
+    single = {
         "sampling": lambda: estimator.sampled(raw),
         "view": lambda: view(points),
         "root encoder": stage(encoder, "root", "encoder"),
         "root": stage(RootNetwork(network), "root"),
         "parts encoder": _twice(stage(encoder, "parts", "encoder")),
         "parts": _twice(stage(PartsNetwork(network, category.num_parts), "parts")),
+        "networks": lambda: networks(estimator.variables, points),
+        "networks without sides": lambda: without_sides(estimator.variables, points),
         "whole": lambda: estimator(raw),
     }
 
@@ -165,7 +172,7 @@ def _calls(name: str) -> tuple[Any, dict[str, Callable[[], Any]], dict[str, Call
         "step without registration": step("alone"),
         "step": step("whole"),
     }
-    return estimator, estimate, track
+    return estimator, single, track
 
 
 def _twice(call: Callable[[], Any]) -> Callable[[], Any]:
