@@ -34,7 +34,8 @@ from caper_jax.training.calibration import mixed_frames, nearer_reading
 FRAMES = 40_000
 _SPLIT = "train"
 _BATCH = 512
-_STEPS = 6000
+_STEPS = 6000  # at least
+_PASSES = 25  # over many frames
 _PER_CALL = 100  # steps compiled into one call
 _RATE = 2e-3
 _DECAY = 1e-3
@@ -174,7 +175,8 @@ def _fit(features: np.ndarray, off: SidesOutput, width: int, num_parts: int, see
     mean, deviation = features.mean(0), features.std(0)
     scale = 1.0 / (deviation + 0.02)  # what never varies stays small
     params |= {"mean": jnp.asarray(mean), "scale": jnp.asarray(scale)}
-    schedule = optax.cosine_decay_schedule(_RATE, _STEPS)
+    calls = max(_STEPS, _PASSES * len(features) // _BATCH) // _PER_CALL
+    schedule = optax.cosine_decay_schedule(_RATE, calls * _PER_CALL)
     optimizer = optax.adamw(schedule, weight_decay=_DECAY)
 
     def loss(free, chosen, right, key):
@@ -200,8 +202,8 @@ def _fit(features: np.ndarray, off: SidesOutput, width: int, num_parts: int, see
     data = jax.device_put((features, off))
     free = {name: value for name, value in params.items() if name not in ("mean", "scale")}
     carry = free, optimizer.init(free)
-    with progress("fitting sides", total=_STEPS) as bar:
-        for number in range(_STEPS // _PER_CALL):
+    with progress("fitting sides", total=calls * _PER_CALL) as bar:
+        for number in range(calls):
             own = jax.random.split(jax.random.fold_in(keys[1], number), _PER_CALL)
             carry, values = several(carry, own, data)
             bar.update(_PER_CALL, loss=float(values.mean()))
