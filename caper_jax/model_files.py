@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import lzma
 import zipfile
 import zlib
 from pathlib import Path
@@ -15,6 +14,14 @@ import numpy as np
 
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
+
+try:
+    from lzma import LZMAError
+
+    _METHOD = zipfile.ZIP_LZMA
+except ImportError:  # a Python built without liblzma writes what it can read itself
+    LZMAError = zlib.error  # type: ignore[assignment,misc]
+    _METHOD = zipfile.ZIP_DEFLATED
 
 PyTree = Any
 WEIGHTS_FILE = "weights.npz"
@@ -43,7 +50,7 @@ def write_model(directory: str | Path, variables: PyTree, card: dict[str, Any]) 
     text = _card_text(card)
     buffer = io.BytesIO()
     # As np.savez_compressed, and 3 % smaller; np.load reads either.
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_LZMA) as file:
+    with zipfile.ZipFile(buffer, "w", _METHOD) as file:
         for name, array in arrays.items():
             with file.open(f"{name}.npy", "w") as member:
                 np.lib.format.write_array(member, array, allow_pickle=False)
@@ -78,7 +85,8 @@ def read_model(directory: str | Path) -> tuple[dict[str, Any], PyTree]:
       (card, variables): the card as written, and nested dicts of float32 numpy arrays.
 
     Raises:
-      CaperError: a file is missing, damaged, or holds a weight that is not a finite float.
+      CaperError: a file is missing, damaged, or holds a weight that is not a finite float; a
+        Python without lzma.
     """
     directory = Path(directory)
     for name in (CARD_FILE, WEIGHTS_FILE):
@@ -103,11 +111,17 @@ def read_model(directory: str | Path) -> tuple[dict[str, Any], PyTree]:
         OSError,
         EOFError,
         KeyError,
+        NotImplementedError,  # no such compression
         zipfile.BadZipFile,
         zlib.error,
-        lzma.LZMAError,
+        LZMAError,
     ) as error:
         raise CaperError(f"{path} is damaged or not a weights file: {error}") from error
+    except RuntimeError as error:  # zipfile's, for a compression that Python lacks
+        raise CaperError(
+            f"{path}: {error}; this Python was built without liblzma: install that (liblzma-dev, "
+            "xz) and build Python again, or use another Python"
+        ) from error
     for name, array in arrays.items():
         if array.dtype not in (np.float16, np.float32):
             raise CaperError(f"{path}: {name!r} is {array.dtype}, expected float16 or float32")

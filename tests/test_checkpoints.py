@@ -6,6 +6,7 @@ import gc
 import json
 import sys
 import warnings
+import zipfile
 from pathlib import Path
 
 import jax
@@ -265,6 +266,13 @@ def test_what_cannot_be_exported_is_named(tmp_path):
         with pytest.raises(CaperError, match="cannot be written as JSON"):
             write_model(tmp_path / "m", variables(), card)
     assert not (tmp_path / "m").exists()
+
+
+def test_a_python_without_lzma_says_so(tmp_path, monkeypatch):
+    write_model(tmp_path, variables(), CARD)
+    monkeypatch.setattr(zipfile, "lzma", None)
+    with pytest.raises(CaperError, match="built without liblzma"):
+        read_model(tmp_path)
 
 
 def test_a_damaged_model_is_named(tmp_path):

@@ -59,7 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         from caper_jax.training import sides
 
         number = sides.FRAMES if arguments.sides is True else arguments.sides
-        options = (PRESETS["fast"].sides_width, number, arguments.seed)
+        own = load(arguments.category, arguments.weights).network.sides_width
+        options = (own or PRESETS["fast"].sides_width, number, arguments.seed)
         sides.add_sides(arguments.weights, arguments.category, TRAINING_DATA, *options)
     estimator = load(arguments.category, arguments.weights)
     frames = arguments.frames or FRAMES
