@@ -152,6 +152,7 @@ def test_too_few_frames_are_refused():
 
 def test_a_model_that_is_always_turned_is_refused(monkeypatch):
     monkeypatch.setattr(fitting, "_TURNED", 1e-6)
+    monkeypatch.setattr(fitting, "_BATCH", 64)
     data = GeneratorConfig(instances=64, grid=48, num_points=1024, noise=("none",))
     with pytest.raises(fitting.TurnedModel, match="train the model longer"):
-        fitting.fit_sides(load("box"), data, 64, 1024)
+        fitting.fit_sides(load("box"), data, 64, 128)
