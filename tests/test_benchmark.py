@@ -14,10 +14,11 @@ from caper_jax import cli
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.cli import benchmark
 from caper_jax.cli.benchmarks import gate, iou, naive, profile, se3, timing
-from caper_jax.cli.benchmarks.models import chain
+from caper_jax.cli.benchmarks.models import chain, random_estimator
 from caper_jax.errors import CaperError
 from caper_jax.networks import caper, hs_encoder
 from caper_jax.networks.hs_encoder import HSEncoder
+from caper_jax.networks.presets import PRESETS, preset
 
 BASELINE = {"estimator": 2.0, "log": 0.4}
 
@@ -192,3 +193,12 @@ def test_benchmarks_are_listed(capsys):
 def test_every_benchmark_has_help(name, capsys):
     assert cli.main(["benchmark", name, "--help"]) == 0
     assert "--json" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_a_random_model_of_every_preset_estimates(name):
+    """Also of chains longer than any category, as the benchmark of scaling measures them."""
+    estimator = random_estimator(chain(5), preset(name))
+    clouds = jax.ShapeDtypeStruct((2, 1024, 3), np.float32)
+    found = jax.eval_shape(estimator.function, estimator.variables, clouds)
+    assert found.pose.rotation.shape == (2, 5, 3, 3)

@@ -12,13 +12,20 @@ from caper_jax.networks.caper import NetworkConfig
 
 
 def random_estimator(category: Category, network: NetworkConfig) -> Estimator:
-    """With the weights that training begins from."""
+    """With the weights that training begins from, and sides that say nothing."""
     import jax
 
+    from caper_jax.networks.sides import SidesNetwork, num_features
     from caper_jax.training.task import LossConfig, Task
 
     task = Task(category, network, LossConfig())
-    return Estimator(category, network, task.init(jax.random.key(0)))
+    variables = task.init(jax.random.key(0))
+    if network.sides_width:
+        module = SidesNetwork(network.sides_width, category.num_parts)
+        features = np.zeros((1, num_features(category.num_parts)), np.float32)
+        sides = module.init(jax.random.key(1), features)["params"]
+        variables = {**variables, "params": {**variables["params"], "sides": sides}}
+    return Estimator(category, network, variables)
 
 
 def clouds(category: Category, batch: int, num_points: int = 1024) -> np.ndarray:
