@@ -55,13 +55,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     from caper_jax.training.run import TRAINING_DATA
 
     if arguments.sides:
-        from caper_jax.networks.presets import PRESETS
         from caper_jax.training import sides
 
         number = sides.FRAMES if arguments.sides is True else arguments.sides
-        own = load(arguments.category, arguments.weights).network.sides_width
-        options = (own or PRESETS["fast"].sides_width, number, arguments.seed)
-        sides.add_sides(arguments.weights, arguments.category, TRAINING_DATA, *options)
+        options = {"frames": number, "seed": arguments.seed}
+        sides.add_sides(arguments.weights, arguments.category, TRAINING_DATA, **options)
     estimator = load(arguments.category, arguments.weights)
     frames = arguments.frames or FRAMES
     section = calibrate(estimator, TRAINING_DATA, frames, arguments.seed)

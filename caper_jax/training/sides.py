@@ -26,6 +26,7 @@ from caper_jax.geometry import se3
 from caper_jax.model_files import write_model
 from caper_jax.networks.canonical import rotate, view_rotation
 from caper_jax.networks.caper import NetworkConfig
+from caper_jax.networks.presets import PRESETS
 from caper_jax.networks.sides import SidesNetwork, SidesOutput
 from caper_jax.progress import progress
 from caper_jax.reading import articulated_pose, features_of, read, readings
@@ -107,7 +108,7 @@ def add_sides(
     directory: str | Path,
     category: str,
     config: GeneratorConfig,
-    width: int,
+    width: int | None = None,
     frames: int = FRAMES,
     seed: int = 0,
 ) -> None:
@@ -118,13 +119,15 @@ def add_sides(
     Args:
       directory: of the model.
       category: its name, or FILE.py:NAME.
-      config, width, frames, seed: see ``fit_sides``.
+      width: of the network; None for that of the older, or of the fast preset's.
+      config, frames, seed: see ``fit_sides``.
 
     Raises:
       CaperError: see ``fit_sides`` and ``estimator.load``; the model is left as it was.
     """
     estimator = load(category, directory)
     card, variables = estimator.card, estimator.variables
+    width = width or estimator.network.sides_width or PRESETS["fast"].sides_width
     fitted = fit_sides(estimator, config, width, frames, seed)
     params = {**variables["params"], "sides": fitted}
     run = {**card["run"], "network": {**card["run"]["network"], "sides_width": width}}
@@ -207,6 +210,6 @@ def _fit(features: np.ndarray, off: SidesOutput, width: int, num_parts: int, see
             own = jax.random.split(jax.random.fold_in(keys[1], number), _PER_CALL)
             carry, values = several(carry, own, data)
             bar.update(_PER_CALL, loss=float(values.mean()))
-    # In eight bits, which costs nothing that can be measured: files become smaller.
+    # Rounded to bfloat16, which costs nothing that can be measured: files become smaller.
     short = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16).astype(jnp.float32), carry[0])
     return jax.device_get(params | short)
