@@ -10,9 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax.errors import FlaxError
+from quick import quick_jit
+from tiny import random_like
 
 from caper_jax.errors import CaperError
-from caper_jax.networks.layers import BatchNorm, Dense, Weights
+from caper_jax.networks.fast_encoder import FastEncoder, FastEncoderConfig
+from caper_jax.networks.layers import BatchNorm, Dense, Weights, max_over_points
 
 POINTS = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
 
@@ -72,3 +75,48 @@ def test_products_of_wide_layers_round_their_factors_where_asked_to():
         np.testing.assert_allclose(found, expected, atol=1e-5)
         assert found.dtype == np.float32
         assert (np.abs(found - plain).max() > 1e-4) == rounded
+
+
+def test_maximum_over_points_has_the_value_and_slopes_of_jax():
+    """Also where entries are equal, and in forward mode; a NaN is passed on."""
+    rng = np.random.default_rng(3)
+    features = np.maximum(rng.normal(size=(2, 6, 5)), 0.0).astype(np.float32)
+    features[0, :, 0], features[1, :, 1] = 0.0, np.round(features[1, :, 1])
+    weights = rng.normal(size=(2, 5)).astype(np.float32)
+    change = rng.normal(size=features.shape).astype(np.float32)
+
+    def plain(features):
+        return features.max(axis=1)
+
+    found, expected = (
+        (
+            *jax.jvp(function, (features,), (change,)),
+            jax.grad(lambda x, f=function: (weights * f(x)).sum())(features),
+        )
+        for function in (max_over_points, plain)
+    )
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+    features[0, 2, 3] = np.nan
+    value, slope = jax.jvp(max_over_points, (features,), (features,))
+    np.testing.assert_array_equal(np.argwhere(np.isnan(value)), [[0, 3]])
+    np.testing.assert_array_equal(np.argwhere(np.isnan(slope)), [[0, 3]])
+
+
+def test_slopes_are_finite_where_the_compiler_rounds_maxima_twice():
+    """Unoptimised, XLA computes the features once for their maximum and again for its slope."""
+    config = FastEncoderConfig(16, 1, (0.2, 0.4), width=8, blocks=1, last=8)
+    encoder = FastEncoder(config)
+    points = np.random.default_rng(4).normal(size=(1, 64, 3)).astype(np.float32)
+    shapes = jax.eval_shape(partial(encoder.init, train=False), jax.random.key(0), points)
+    variables = random_like(shapes, seed=5)
+
+    def total(params, points):
+        features = encoder.apply(variables | {"params": params}, points, train=False)
+        return features.shared.sum() + features.levels[-1].features.sum()
+
+    slopes, expected = (
+        compiled(jax.grad(total, argnums=(0, 1)))(variables["params"], points)
+        for compiled in (quick_jit, jax.jit)
+    )
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-3), slopes, expected)

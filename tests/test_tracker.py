@@ -217,7 +217,7 @@ def test_scans_loops_vmaps_and_slopes():
             found = toy(variables | {"params": params}).track(observations, begin)
             return sum((weights[name] * getattr(found.pose, name)).sum() for name in weights), found
 
-        differentiate = jax.jit(jax.grad(weighed, argnums=(0, 1), has_aux=True))
+        differentiate = quick_jit(jax.grad(weighed, argnums=(0, 1), has_aux=True))
 
         def directed(leaf):
             direction = rng.normal(size=leaf.shape)

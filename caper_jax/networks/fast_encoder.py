@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from caper_jax.networks.features import Features, Level
 from caper_jax.networks.graph import squared_distances
-from caper_jax.networks.layers import BatchNorm, Dense
+from caper_jax.networks.layers import BatchNorm, Dense, max_over_points
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class FastEncoder(nn.Module):
         features = norm_relu(Dense(config.width)(features))
         features = norm_relu(Dense(config.width)(features))
         for _ in range(config.blocks):
-            shared = jnp.concatenate([features.max(axis=1), features.mean(axis=1)], -1)
+            shared = jnp.concatenate([max_over_points(features), features.mean(axis=1)], -1)
             mixed = Dense(config.width)(features)
             mixed += Dense(config.width, use_bias=False)(shared)[:, None, :]
             features += norm_relu(mixed)
@@ -113,4 +113,5 @@ class FastEncoder(nn.Module):
         window = radius * config.scales[0]
         closeness = -squared_distances(points, centers) / (2.0 * window * window)[:, None, None]
         level = Level(last, jax.nn.softmax(closeness))
-        return Features(points, (level,), last.max(axis=1) if config.global_feature else None)
+        pooled = max_over_points(last) if config.global_feature else None
+        return Features(points, (level,), pooled)

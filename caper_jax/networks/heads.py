@@ -8,7 +8,13 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from caper_jax.networks.features import BlockDense, Features
-from caper_jax.networks.layers import BatchNorm, Dense, product, weights_first
+from caper_jax.networks.layers import (
+    BatchNorm,
+    Dense,
+    max_over_points,
+    product,
+    weights_first,
+)
 
 
 @dataclass(frozen=True)
@@ -58,13 +64,14 @@ class PooledHead(nn.Module):
         first, second, third = self.config.widths
         if self.config.pool_first:
             rows = features.levels[-1].features
-            hidden = jnp.concatenate([rows.max(axis=1), rows.mean(axis=1)], -1)
+            hidden = jnp.concatenate([max_over_points(rows), rows.mean(axis=1)], -1)
             # Leaky: without a norm before them, plain rectifiers can all die in the first steps,
             # and the head then predicts one constant for every cloud.
             hidden = nn.leaky_relu(Dense(first)(hidden))
             hidden = nn.leaky_relu(Dense(second)(hidden))
         else:
-            hidden = _pointwise(features, first, second, self.with_points, train).max(axis=1)
+            rows = _pointwise(features, first, second, self.with_points, train)
+            hidden = max_over_points(rows)
             hidden = _norm_relu(Dense(third)(hidden), train)
         hidden = nn.Dropout(self.config.dropout, deterministic=not train)(hidden)
         return Dense(self.outputs)(hidden)

@@ -20,7 +20,13 @@ from caper_jax.networks.graph import (
     nearest_row,
     neighbour_max,
 )
-from caper_jax.networks.layers import BatchNorm, Dense, Weights, weights_first
+from caper_jax.networks.layers import (
+    BatchNorm,
+    Dense,
+    Weights,
+    max_over_points,
+    weights_first,
+)
 
 # Reverse mode is all there is here anyway: the reductions over neighbours know no other.
 dense = partial(Dense, dot_general=weights_first)
@@ -221,4 +227,4 @@ class HSEncoder(nn.Module):
             Level(jnp.concatenate([f2, f3], -1), space.upsample[0]),
             Level(f4, space.upsample[1]),
         )
-        return Features(points, levels, f4.max(1) if config.global_feature else None)
+        return Features(points, levels, max_over_points(f4) if config.global_feature else None)

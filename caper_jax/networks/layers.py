@@ -1,5 +1,5 @@
-"""Dense layer and batch norm of Flax, traced without evaluating their initialisers again; and a
-product whose backward pass lets go of its input early.
+"""Dense layer and batch norm of Flax, traced without evaluating their initialisers again; a product
+whose backward pass lets go of its input early; and a maximum whose slope is finite everywhere.
 
 Flax compares every weight with its initialiser's output, traced anew, at each use. That is a third
 of the time to a first pose; the shape is an argument of the initialiser, and is compared here.
@@ -25,6 +25,28 @@ def after(done: jax.Array, array: jax.Array) -> jax.Array:
     Meant for gradients, where one that is not finite makes all the others useless.
     """
     return jnp.where(jnp.isfinite(done), array, jnp.nan)
+
+
+_TIE = 1e-5  # of the maximum: more than its entries differ by where they are computed twice
+
+
+@jax.custom_jvp
+def max_over_points(features):
+    """[B, N, C] -> [B, C] maximum; entries that reach it share its gradient, as in JAX.
+
+    JAX divides by the number of entries that equal the maximum. Where the compiler computes them
+    a second time with other rounding, that is none, and the gradient is NaN.
+    """
+    return features.max(axis=1)
+
+
+@max_over_points.defjvp
+def _max_over_points_jvp(primals, tangents):
+    (features,), (change,) = primals, tangents
+    top = features.max(axis=1, keepdims=True)
+    reached = ~(features < top - _TIE * jnp.abs(top))  # true of NaN, which is passed on
+    count = jnp.maximum(reached.sum(axis=1), 1)
+    return top[:, 0], jnp.where(reached, change, 0.0).sum(axis=1) / count
 
 
 _WIDE = 64  # input channels, from which a product is worth rounding
