@@ -245,13 +245,22 @@ def load(category: str, weights: str | Path | None = None, object_scale: float =
     card, variables = read_model(directory)
     if card.get("category") != name:
         raise CaperError(f"{directory} holds a model of {card.get('category')!r}, not {name!r}")
+    network = network_of(card, directory)
+    _check_variables(directory, variables, definition, network)
+    return Estimator(definition.scaled(object_scale), network, variables, card)
+
+
+def network_of(card: dict[str, Any], directory: Path) -> NetworkConfig:
+    """The network that the card of the model in ``directory`` describes.
+
+    Raises:
+      CaperError: the card describes none, or one that this version does not know.
+    """
     try:
         sizes = card["run"]["network"]
     except (KeyError, TypeError) as error:
         raise CaperError(f"{directory / CARD_FILE} lacks run.network; train again") from error
-    network = from_dict(NetworkConfig, sizes, str(directory / CARD_FILE))
-    _check_variables(directory, variables, definition, network)
-    return Estimator(definition.scaled(object_scale), network, variables, card)
+    return from_dict(NetworkConfig, sizes, str(directory / CARD_FILE))
 
 
 def _check_variables(directory: Path, variables, category: Category, network: NetworkConfig):

@@ -88,19 +88,8 @@ def read_model(directory: str | Path) -> tuple[dict[str, Any], PyTree]:
       CaperError: a file is missing, damaged, or holds a weight that is not a finite float; a
         Python without lzma.
     """
-    directory = Path(directory)
-    for name in (CARD_FILE, WEIGHTS_FILE):
-        if not (directory / name).is_file():
-            raise CaperError(f"{directory} is not a model directory: it has no {name}")
-    path = directory / CARD_FILE
-    try:
-        card = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise CaperError(f"{path} is not valid JSON: {error}") from error
-    if not isinstance(card, dict):
-        raise CaperError(f"{path} must hold a JSON object, got {type(card).__name__}")
-
-    path = directory / WEIGHTS_FILE
+    card = read_card(directory)
+    path = Path(directory) / WEIGHTS_FILE
     try:
         # From memory: np.load leaves the file open where it is damaged.
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
@@ -128,6 +117,26 @@ def read_model(directory: str | Path) -> tuple[dict[str, Any], PyTree]:
         if not np.isfinite(array).all():
             raise CaperError(f"{path}: {name!r} has values that are not finite")
     return card, unflatten({name: a.astype(np.float32) for name, a in arrays.items()}, str(path))
+
+
+def read_card(directory: str | Path) -> dict[str, Any]:
+    """The card of a model directory.
+
+    Raises:
+      CaperError: no model directory, or a card that is damaged.
+    """
+    directory = Path(directory)
+    for name in (CARD_FILE, WEIGHTS_FILE):
+        if not (directory / name).is_file():
+            raise CaperError(f"{directory} is not a model directory: it has no {name}")
+    path = directory / CARD_FILE
+    try:
+        card = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise CaperError(f"{path} is not valid JSON: {error}") from error
+    if not isinstance(card, dict):
+        raise CaperError(f"{path} must hold a JSON object, got {type(card).__name__}")
+    return card
 
 
 def flatten(variables: PyTree) -> dict[str, Any]:

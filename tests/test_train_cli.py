@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -14,9 +15,9 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from caper_jax import categories, cli
-from caper_jax.configuration import update
+from caper_jax.configuration import to_dict, update
 from caper_jax.errors import CaperError
-from caper_jax.model_files import read_model
+from caper_jax.model_files import read_model, write_model
 from caper_jax.training import run
 from caper_jax.visualization.curves import training_curves
 
@@ -148,8 +149,37 @@ def test_a_model_can_start_another_run(model, tmp_path):
     assert 0 < max(moved) < 0.1
 
 
-def test_all_categories_one_after_the_other(tmp_path, monkeypatch, capsys):
-    (tmp_path / "models" / "drawer").mkdir(parents=True)
+def test_a_run_from_a_model_has_its_network(model, tmp_path, monkeypatch):
+    def configured(*options):
+        configs = []
+        ended = types.SimpleNamespace(finished=False, state=types.SimpleNamespace(step=0))
+        monkeypatch.setattr(run, "train", lambda config, *_: configs.append(config) or ended)
+        begin = ["train", "--category", "laptop", "--from", str(model), "--out", str(tmp_path)]
+        assert cli.main([*begin, *options]) == 130
+        return configs[0]
+
+    whole = configured()
+    sizes = read_model(model)[0]["run"]["network"]
+    assert whole.category == "laptop" and to_dict(whole.network) == sizes
+    assert whole.data.num_points == sizes["num_points"] == 128
+    fast = run.preset("fast", "laptop")
+    assert whole.loss == fast.loss and whole.training == fast.training
+    wider = configured("--set", "network.fast.width=24").network
+    assert wider == replace(whole.network, fast=replace(whole.network.fast, width=24))
+    assert configured("--preset", "paper") == run.preset("paper", "laptop")
+
+
+def test_a_run_from_a_published_network_is_of_that_preset(tmp_path):
+    network = {"encoder": "hs", "corrections": 2}
+    write_model(tmp_path, {}, {"run": {"network": network}})
+    config = run.preset_of(tmp_path, "box")
+    paper = run.preset("paper", "box")
+    assert config == replace(paper, network=replace(paper.network, corrections=2))
+
+
+def test_all_categories_one_after_the_other(model, tmp_path, monkeypatch, capsys):
+    shutil.copytree(model, tmp_path / "models")
+    shutil.copytree(model, tmp_path / "models" / "drawer")
     called = []
 
     def train(config, directory, initial):

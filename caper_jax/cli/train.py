@@ -40,7 +40,9 @@ def build_parser() -> argparse.ArgumentParser:
         required=True,
         help="e.g. box, or FILE.py:NAME for one of your own, or all, one after the other",
     )
-    parser.add_argument("--preset", default="fast", help="fast or paper (default: fast)")
+    parser.add_argument(
+        "--preset", help="fast or paper (default: fast; with --from the network of that model)"
+    )
     parser.add_argument("--config", type=Path, help="TOML file of settings over the preset's")
     parser.add_argument(
         "--set",
@@ -102,7 +104,7 @@ def _train(category: str, arguments: argparse.Namespace, out: Path, initial: Pat
     """Trains one category; returns the exit code."""
     from caper_jax.training import run
 
-    result = run.train(_configuration(category, arguments), out, initial)
+    result = run.train(_configuration(category, arguments, initial), out, initial)
     steps = int(result.state.step)
     if not result.finished:
         print(f"stopped at step {steps}; the same command goes on from there")
@@ -125,12 +127,15 @@ def _plot(category: str, out: Path) -> None:
         write_curves(out / "curves.png", training_curves(f"Training of {category}", rows))
 
 
-def _configuration(category: str, arguments: argparse.Namespace) -> RunConfig:
-    """The run that the arguments describe."""
+def _configuration(category: str, arguments: argparse.Namespace, initial: Path | None) -> RunConfig:
+    """The run that the arguments describe; ``initial`` as for ``run.train``."""
     from caper_jax.configuration import override, update
     from caper_jax.training import run
 
-    config = run.preset(arguments.preset, category)
+    if initial is not None and arguments.preset is None:
+        config = run.preset_of(initial, category)
+    else:
+        config = run.preset(arguments.preset or "fast", category)
     if arguments.config is not None:
         config = update(config, arguments.config)
     config = _with_dataset(config, arguments)

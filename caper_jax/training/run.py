@@ -23,8 +23,15 @@ from caper_jax.data import open_dataset
 from caper_jax.data.loader import LabelledClouds, Loader, LoaderConfig
 from caper_jax.data.synthetic.scene import Batch, Generator, GeneratorConfig
 from caper_jax.errors import CaperError, unknown_name
-from caper_jax.estimator import load
-from caper_jax.model_files import flatten, read_model, unflatten, write_card, write_model
+from caper_jax.estimator import load, network_of
+from caper_jax.model_files import (
+    flatten,
+    read_card,
+    read_model,
+    unflatten,
+    write_card,
+    write_model,
+)
 from caper_jax.networks.caper import NetworkConfig
 from caper_jax.networks.presets import PRESETS as NETWORKS
 from caper_jax.training import parallel, sides
@@ -84,6 +91,20 @@ class RunConfig:
                 f"data.num_points = {self.data.num_points} and network.num_points = "
                 f"{self.network.num_points} must agree"
             )
+
+
+def preset_of(directory: str | Path, category: str) -> RunConfig:
+    """The run of the preset that a model is of, with the network of that model.
+
+    Raises:
+      CaperError: no model directory, a damaged card, or an unknown category.
+    """
+    network = network_of(read_card(directory), Path(directory))
+    name = next(name for name, other in NETWORKS.items() if other.encoder == network.encoder)
+    config = preset(name, category)
+    return replace(
+        config, network=network, data=replace(config.data, num_points=network.num_points)
+    )
 
 
 def preset(name: str, category: str) -> RunConfig:
@@ -238,8 +259,8 @@ def initial_variables(
     fits = all(name in found and np.shape(found[name]) == np.shape(wanted[name]) for name in taken)
     if not fits or (same_category and found.keys() != wanted.keys() - new):
         raise CaperError(
-            f"{directory}: its weights are of another network than this run's; use the same "
-            "preset and network settings"
+            f"{directory}: its weights are of another network than this run's; leave out the "
+            "preset and the network settings, and the run has its"
         )
     return unflatten(wanted | {name: jnp.asarray(found[name], jnp.float32) for name in taken})
 
