@@ -16,6 +16,7 @@ import pytest
 from caper_jax import cli
 from caper_jax.cli import common
 from caper_jax.errors import CaperError
+from caper_jax.estimator import shipped_weights
 from caper_jax.progress import format_seconds, progress
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -231,3 +232,12 @@ class TestBin:
             env={"PATH": str(folder)},
             check=False,
         )
+
+
+def test_a_model_that_ships_goes_by_its_category(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert common.model_folder("box") == shipped_weights() / "box"
+    for text in ("bax", "runs/box", str(tmp_path / "box")):
+        assert common.model_folder(text) == Path(text)
+    (tmp_path / "box").mkdir()
+    assert common.model_folder("box") == Path("box")

@@ -128,6 +128,17 @@ def positive_float(text: str) -> float:
     return _checked(float, text, "a number above 0", lambda value: 0 < value < math.inf)
 
 
+def model_folder(text: str) -> Path:
+    """Argument type: a folder, or the name of a category for the model that ships."""
+    folder = Path(text)
+    if not folder.exists() and folder.name == text:
+        from caper_jax.estimator import shipped_weights
+
+        if (shipped_weights() / text).is_dir():
+            return shipped_weights() / text
+    return folder
+
+
 OBJECT_SCALE: dict[str, Any] = {
     "type": positive_float,
     "default": 1.0,

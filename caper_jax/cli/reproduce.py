@@ -173,7 +173,7 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "initial": (
         "--from",
         {
-            "type": Path,
+            "type": common.model_folder,
             "metavar": "DIR",
             "dest": "initial",
             "help": "model that each run starts from, as for caper train (default: none)",

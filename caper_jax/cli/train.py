@@ -27,11 +27,18 @@ def build_parser() -> argparse.ArgumentParser:
         "model (weights.npz, model.json) for --weights of the other commands, and curves.png.",
         [
             ("--category box --minutes 30 --out runs/box", "the fast preset, half an hour"),
-            ("--category box --config configs/fast.toml --minutes 30 --out runs/box", ""),
+            (
+                "--category box --config configs/fast.toml --minutes 30 --out runs/box",
+                "your settings",
+            ),
             ("--category box --from runs/box --minutes 10 --out runs/box2", "goes on from a model"),
-            ("--category laptop --preset paper --steps 1000 --out runs/paper", ""),
+            ("--category box --from box --minutes 10 --out runs/mine", "from the one that ships"),
+            ("--category laptop --preset paper --steps 1000 --out runs/paper", "as published"),
             ("--category box --data ROOT --format artimage --out runs/own", "your own data"),
-            ("--category box --set training.learning_rate=1e-3 --steps 500 --out runs/try", ""),
+            (
+                "--category box --set training.learning_rate=1e-3 --steps 500 --out runs/try",
+                "one setting",
+            ),
             ("--category all --from runs/box --minutes 60 --out runs", "each into runs/<category>"),
         ],
     )
@@ -54,11 +61,12 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--from",
-        type=Path,
+        type=common.model_folder,
         dest="initial",
         metavar="DIR",
-        help="start from the weights of this model instead of random ones; one of another "
-        "category gives its encoders; a folder of models gives each category its own",
+        help="start from the weights of this model, or of the one that ships for a category, "
+        "instead of random ones; one of another category gives its encoders; a folder of models "
+        "gives each category its own",
     )
     parser.add_argument(
         "--data",

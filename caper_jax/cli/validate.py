@@ -30,7 +30,7 @@ def build_parser() -> argparse.ArgumentParser:
         [
             ("--format artimage --data ArtImage", "all categories"),
             ("--format caper --data box_test.h5", "a generated file"),
-            ("--format reartmix --data ReArtMix --category box --json box.json", ""),
+            ("--format reartmix --data ReArtMix --category box --json box.json", "for programs"),
         ],
     )
     parser.add_argument("--format", required=True, help=f"layout of the data: {', '.join(FORMATS)}")
