@@ -23,7 +23,7 @@ from caper_jax.evaluation.tracking import (
     summarise_tracks,
     track_video,
 )
-from caper_jax.model_files import CARD_FILE, read_model
+from caper_jax.model_files import CARD_FILE, read_card
 from caper_jax.progress import progress
 from caper_jax.tracker import Tracker, config_for
 from caper_jax.tracking.config import TrackerConfig
@@ -128,7 +128,7 @@ def need_models(
 
 def _model_category(directory: Path) -> Any:
     """The category that a model's card names."""
-    return read_model(directory)[0].get("category")
+    return read_card(directory).get("category")
 
 
 def open_videos(
