@@ -18,7 +18,6 @@ from caper_jax.errors import CaperError
 from caper_jax.geometry.solid_bounds import bounds
 from caper_jax.geometry.solids import Solid, box, cone, cylinder, ellipsoid, frustum
 
-pytestmark = pytest.mark.xdist_group("caster")
 KINDS = ("box", "cylinder", "ellipsoid", "frustum", "cone")
 FLAT = ("box", "frustum")
 PAIRS = [(kind, None) for kind in KINDS] + list(itertools.product(KINDS, KINDS))

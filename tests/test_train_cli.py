@@ -7,6 +7,7 @@ import math
 import shutil
 import types
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -21,7 +22,6 @@ from caper_jax.model_files import read_model, write_model
 from caper_jax.training import run
 from caper_jax.visualization.curves import training_curves
 
-pytestmark = pytest.mark.xdist_group("train_cli")
 ROOT = Path(__file__).resolve().parents[1]
 # A batch that no eight devices can share: compiling for one is faster.
 TINY = ["--category", "box", "--config", str(ROOT / "configs" / "debug.toml")]
@@ -147,6 +147,26 @@ def test_a_model_can_start_another_run(model, tmp_path):
         )
     ]
     assert 0 < max(moved) < 0.1
+
+
+def test_a_model_can_be_averaged_with_what_it_becomes(model, tmp_path, capsys):
+    begin = ["train", *TINY, "--steps", "10", "--from", str(model)]
+    for name, share in (("whole", 0.0), ("mixed", 0.75)):
+        out = ["--set", f"start_share={share}", "--out", str(tmp_path / name)]
+        assert cli.main([*begin, *out]) == 0
+    first, whole, mixed = (
+        read_model(at)[1] for at in (model, tmp_path / "whole", tmp_path / "mixed")
+    )
+    expected = jax.tree.map(lambda a, b: 0.75 * a + 0.25 * b, first, whole)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-3, atol=1e-4), mixed, expected)
+    moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), first, whole)
+    assert max(jax.tree.leaves(moved)) > 0.01
+
+    no_start = ["train", *TINY, "--steps", "10", "--set", "start_share=0.5"]
+    assert cli.main([*no_start, "--out", str(tmp_path / "none")]) == 2
+    assert "start_share = 0.5 needs a model of 'box' to start from" in capsys.readouterr().err
+    with pytest.raises(CaperError, match=r"start_share must be in \[0, 1\), got 1.0"):
+        replace(run.preset("fast", "box"), start_share=1.0)
 
 
 def test_a_run_from_a_model_has_its_network(model, tmp_path, monkeypatch):

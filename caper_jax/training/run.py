@@ -70,6 +70,9 @@ class RunConfig:
       loader: a dataset to train on instead of generated frames.
       loss: weights and targets.
       training: optimiser and budget.
+      start_share: how much of the model that a run starts from is in the weights it writes, the
+        rest being what it trained; their average is often better than either. That model must be
+        of the same category.
       sides_frames: generated frames to fit the network of ``sides_width`` channels on, see
         ``training.sides``. Models trained on a dataset have none.
       calibration_frames: generated frames to calibrate the trained model on, see
@@ -82,10 +85,13 @@ class RunConfig:
     loader: LoaderConfig | None = None
     loss: LossConfig = LossConfig()
     training: TrainingConfig = TrainingConfig(minutes=60.0)
+    start_share: float = 0.0
     sides_frames: int = sides.FRAMES
     calibration_frames: int = FRAMES
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.start_share < 1.0:
+            raise CaperError(f"start_share must be in [0, 1), got {self.start_share}")
         if self.data.num_points != self.network.num_points:
             raise CaperError(
                 f"data.num_points = {self.data.num_points} and network.num_points = "
@@ -145,19 +151,24 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         one); by default the weights are random. A model of another category gives its encoders.
 
     Raises:
-      CaperError: see ``training.loop.fit``.
+      CaperError: see ``training.loop.fit``; a ``start_share`` of no model of this category.
     """
     category = categories.get(config.category)
     config = replace(config, category=category.name)  # FILE.py:NAME may be spelled in many ways
     task = Task(category, config.network, config.loss)
     description = to_dict(config)
     description.pop("training")
-    variables, started_from = task.init(jax.random.key(config.training.seed)), None
+    variables, started_from, same = task.init(jax.random.key(config.training.seed)), None, False
     if initial is not None:
         started_from, stored = read_model(initial)
         same = started_from.get("category") == category.name
         variables = initial_variables(variables, stored, initial, same)
         description["initial"] = started_from
+    if config.start_share and not same:
+        raise CaperError(
+            f"start_share = {config.start_share} needs a model of {category.name!r} to start from"
+        )
+    start = jax.device_get(variables)  # training overwrites it
     mesh = _mesh(config.training.batch_size)
     fit_task = partial(
         fit, directory, config.training, task.loss, variables, mesh=mesh, description=description
@@ -170,7 +181,10 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         card = _card(config, result, draw_sample())
         if started_from is not None:
             card |= _with_origin(card, started_from)
-        write_model(directory, jax.device_get(result.state.variables), card)
+        trained = jax.device_get(result.state.variables)
+        share = config.start_share
+        written = jax.tree.map(lambda a, b: share * a + (1 - share) * b, start, trained)
+        write_model(directory, written, card)
         if config.loader is None:  # of the weights as they are stored, and once they are
             _finish(config, directory)
     return result
