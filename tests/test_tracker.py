@@ -269,6 +269,21 @@ def test_scans_loops_vmaps_and_slopes():
             jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6), found, expected)
 
 
+def test_slopes_remember_the_states_between_frames_alone():
+    """Whatever a frame computes is computed again, so that long videos can be differentiated."""
+    tracker = toy()
+    frame = Observation(*(jax.numpy.asarray(x) for x in (plates(1)[0], True, PLATES)))
+    given = tracker.estimator.variables, tracker.initial_state(), frame
+
+    def kept(*given):
+        return jax.vjp(tracker.function, *given)[1]
+
+    def size(tree):
+        return sum(leaf.size for leaf in jax.tree.leaves(tree))
+
+    assert 0 < size(jax.eval_shape(kept, *given)) < 2 * size(given)
+
+
 class TestMistakes:
     POINTS = plates(1)[0]
 
