@@ -162,6 +162,10 @@ def test_a_model_can_be_averaged_with_what_it_becomes(model, tmp_path, capsys):
     moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), first, whole)
     assert max(jax.tree.leaves(moved)) > 0.01
 
+    # What the first model lacked was random there: it is as trained.
+    new = {"params": {"head": {"kernel": np.ones(3, np.float32)}}}
+    jax.tree.map(np.testing.assert_array_equal, run.averaged(first, new, 0.75), new)
+
     no_start = ["train", *TINY, "--steps", "10", "--set", "start_share=0.5"]
     assert cli.main([*no_start, "--out", str(tmp_path / "none")]) == 2
     assert "start_share = 0.5 needs a model of 'box' to start from" in capsys.readouterr().err

@@ -158,7 +158,9 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
     task = Task(category, config.network, config.loss)
     description = to_dict(config)
     description.pop("training")
-    variables, started_from, same = task.init(jax.random.key(config.training.seed)), None, False
+    variables = task.init(jax.random.key(config.training.seed))
+    stored: dict[str, Any] = {}
+    started_from, same = None, False
     if initial is not None:
         started_from, stored = read_model(initial)
         same = started_from.get("category") == category.name
@@ -168,7 +170,6 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         raise CaperError(
             f"start_share = {config.start_share} needs a model of {category.name!r} to start from"
         )
-    start = jax.device_get(variables)  # training overwrites it
     mesh = _mesh(config.training.batch_size)
     fit_task = partial(
         fit, directory, config.training, task.loss, variables, mesh=mesh, description=description
@@ -182,9 +183,9 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         if started_from is not None:
             card |= _with_origin(card, started_from)
         trained = jax.device_get(result.state.variables)
-        share = config.start_share
-        written = jax.tree.map(lambda a, b: share * a + (1 - share) * b, start, trained)
-        write_model(directory, written, card)
+        if config.start_share:
+            trained = averaged(stored, trained, config.start_share)
+        write_model(directory, trained, card)
         if config.loader is None:  # of the weights as they are stored, and once they are
             _finish(config, directory)
     return result
@@ -277,6 +278,14 @@ def initial_variables(
             "preset and the network settings, and the run has its"
         )
     return unflatten(wanted | {name: jnp.asarray(found[name], jnp.float32) for name in taken})
+
+
+def averaged(start: Any, trained: Any, share: float) -> Any:
+    """Weights of which ``share`` is what a run started from; what is new in it is as trained."""
+    known, mixed = flatten(start), flatten(trained)
+    for name in mixed.keys() & known.keys():
+        mixed[name] = share * known[name].astype(np.float32) + (1 - share) * mixed[name]
+    return unflatten(mixed)
 
 
 def mean_pose(batch: Batch | LabelledClouds) -> dict[str, Any]:
