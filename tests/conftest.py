@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 # Before anything imports jax: a GPU would be slower here, and round differently.
@@ -12,8 +13,25 @@ os.environ["CAPER_CACHE"] = "off"
 
 import jax
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 jax.config.update("jax_num_cpu_devices", 8)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What one test has compiled, the others of this process find."""
+    settings = {
+        "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")),
+        "jax_persistent_cache_min_compile_time_secs": 0.5,
+    }
+    before = {name: getattr(jax.config, name) for name in settings}
+    for change in (settings, before):
+        for name, value in change.items():
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()  # looks at the folder when first used, only
+        if change is settings:
+            yield
 
 
 @pytest.fixture(scope="session")

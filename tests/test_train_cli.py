@@ -13,7 +13,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 
 from caper_jax import categories, cli
 from caper_jax.configuration import to_dict, update
@@ -26,22 +25,6 @@ ROOT = Path(__file__).resolve().parents[1]
 # A batch that no eight devices can share: compiling for one is faster.
 TINY = ["--category", "box", "--config", str(ROOT / "configs" / "debug.toml")]
 TINY += ["--set", "training.batch_size=3"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled_once(tmp_path_factory):
-    """A compilation cache: every training below is one of the same ten steps."""
-    settings = {
-        "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")),
-        "jax_persistent_cache_min_compile_time_secs": 0.5,
-    }
-    before = {name: getattr(jax.config, name) for name in settings}
-    for change in (settings, before):
-        for name, value in change.items():
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()  # looks at the folder when first used, only
-        if change is settings:
-            yield
 
 
 @pytest.fixture(scope="module")
