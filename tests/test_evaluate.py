@@ -133,6 +133,7 @@ def test_every_figure_can_be_computed_from_the_predictions(path, tmp_path, estim
             assert part[name]["mean"] == pytest.approx(values.mean(), rel=1e-4)
             assert part[name]["median"] == pytest.approx(np.median(values), rel=1e-4)
         assert part["iou_size"]["mean"] == pytest.approx(iou.mean(), rel=1e-5)
+        assert part["turned"] == (degrees > 30).mean()
     axis, true_axis = saved["joint_axis"][:, 0], saved["truth_joint_axis"][:, 0]
     offset = saved["joint_pivot"][:, 0] - saved["truth_joint_pivot"][:, 0]
     joint = metrics["joints"][0]
@@ -243,6 +244,7 @@ def test_frames_that_fail_are_counted_not_dropped(path, tmp_path):
     result = report.summarise(evaluation, dataset, "model", "here")
     assert (result["frames"], result["failures"]) == (FRAMES, 2)
     assert result["parts"][0]["rotation_deg"]["mean"] == pytest.approx(2 * 180 / FRAMES)
+    assert result["parts"][0]["turned"] == 2 / FRAMES
     assert result["parts"][0]["iou_full"]["mean"] == pytest.approx((FRAMES - 2) / FRAMES)
     assert result["parts"][1]["rotation_deg"]["median"] == 0
     report.write_report(tmp_path, evaluation, result)

@@ -226,8 +226,8 @@ class TestStatic:
         means, spreads = output.split("**All errors")
         row = cells(means, "box", "lid", "as labelled")
         assert row[:9] == ["1.50", "0.00", "0.00", "0.012", "4.30", "0.00", "0.00", "90.1", "100.0"]
-        assert cells(spreads, "box", "lid", "as labelled", "0.00 / 0.00")[:2] == [
-            *("0.0 / 0.0", "100.0 / 100.0")
+        assert cells(spreads, "box", "lid", "as labelled", "0.00 / 0.00")[:3] == [
+            *("0.0", "0.0 / 0.0", "100.0 / 100.0")
         ]
         assert "5 frames of" in output and "0 failures" in output
         content = json.loads((tmp_path / "out" / "table2.json").read_text())
@@ -244,7 +244,9 @@ class TestStatic:
 
         monkeypatch.setattr(static, "model_predictor", lambda _: fails)
         assert run("table2", tmp_path, *known) == 0
-        assert "5 failures" in capsys.readouterr().out
+        output = capsys.readouterr().out
+        assert "5 failures" in output
+        assert cells(output, "box", "lid", "as labelled", "180.00 / 180.00")[0] == "100.0"
         found = json.loads((tmp_path / "table2.json").read_text())["categories"]["box"]["parts"]
         truth = random_frames(5, 1500)["pose"]
         share = np.linalg.norm(truth.translation, axis=-1) / object_diagonal(truth)[:, None]

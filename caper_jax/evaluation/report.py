@@ -29,6 +29,8 @@ PREDICTIONS_FILE = "predictions.npz"
 # level as the visible share, yet calls 80-100 % highly occluded and finds it worst.)
 _OCCLUSION = ((0.0, 0.4), (0.4, 0.8), (0.8, 1.0))
 _STATE_UNITS = {"revolute": "degrees", "prismatic": "metres"}
+# Beyond this a part is turned, taken for another side of itself, rather than inaccurate.
+TURNED_DEG = 30.0
 
 
 def summarise(
@@ -76,9 +78,16 @@ def summarise(
 
 
 def error_tables(errors: PoseErrors, category: Category) -> dict[str, list[dict[str, Any]]]:
-    """Mean and median of every error, per part and joint, JSON-ready."""
+    """Mean and median of every error, per part and joint, JSON-ready.
+
+    Also "turned" of a part, the share of frames in which it is off by more than 30 deg.
+    """
     parts = [
-        {"name": name, **{key: summary(getattr(errors, key)[:, k]) for key in PART_METRICS}}
+        {
+            "name": name,
+            **{key: summary(getattr(errors, key)[:, k]) for key in PART_METRICS},
+            "turned": float(np.mean(errors.rotation_deg[:, k] > TURNED_DEG)),
+        }
         for k, name in enumerate(category.parts)
     ]
     joints = [
@@ -202,12 +211,14 @@ def _format_occlusion(bins: list[dict[str, Any]]) -> list[str]:
 
 def format_tables(tables: dict[str, Any]) -> list[str]:
     """Lines of the tables of parts and joints that ``error_tables`` gives, mean / median."""
-    rows = [["part", "rotation [deg]", "translation [mm]", "IoU full", "IoU size"]]
+    above = f"> {TURNED_DEG:.0f} deg"
+    rows = [["part", "rotation [deg]", above, "translation [mm]", "IoU full", "IoU size"]]
     for part in tables["parts"]:
         rows.append(
             [
                 part["name"],
                 _cell(part["rotation_deg"], 1, 2),
+                f"{100 * part['turned']:.1f} %",
                 _cell(part["translation_m"], 1000, 1),
                 _cell(part["iou_full"], 1, 3),
                 _cell(part["iou_size"], 1, 3),

@@ -9,7 +9,7 @@ import numpy as np
 from caper_jax import categories
 from caper_jax.evaluation.metrics import object_diagonal
 from caper_jax.evaluation.protocol import evaluate, model_predictor
-from caper_jax.evaluation.report import summarise
+from caper_jax.evaluation.report import TURNED_DEG, summarise
 from caper_jax.evaluation.tables import comparison, runs
 from caper_jax.evaluation.tables.frames import open_frames
 from caper_jax.evaluation.tables.options import Options
@@ -19,8 +19,8 @@ from caper_jax.evaluation.tables.render import Report, Table, number
 _LABEL = "as labelled"
 HEADER = ("category", "part", "truth", *comparison.HEADER[3:])
 SPREAD_HEADER = (
-    *("category", "part", "truth", "rot [deg]", "trans [mm]", "IoU size [%]", "IoU full [%]"),
-    *("joint axis [deg]", "pivot [mm]", "state"),
+    *("category", "part", "truth", "rot [deg]", f"> {TURNED_DEG:.0f} deg [%]", "trans [mm]"),
+    *("IoU size [%]", "IoU full [%]", "joint axis [deg]", "pivot [mm]", "state"),
 )
 
 
@@ -107,6 +107,7 @@ def spread_rows(category: str, label: str, tables: dict[str, Any]) -> list[list[
     for index, part in enumerate(tables["parts"]):
         cells = [
             pair(part["rotation_deg"], 1.0, 2),
+            number(100 * part["turned"], 1),
             pair(part["translation_m"], 1000.0, 1),
             pair(part["iou_size"], 100.0, 1),
             pair(part["iou_full"], 100.0, 1),
