@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 # Before anything imports jax: a GPU would be slower here, and round differently.
@@ -19,19 +18,11 @@ jax.config.update("jax_num_cpu_devices", 8)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
     """What one test has compiled, the others of this process find."""
-    settings = {
-        "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")),
-        "jax_persistent_cache_min_compile_time_secs": 0.5,
-    }
-    before = {name: getattr(jax.config, name) for name in settings}
-    for change in (settings, before):
-        for name, value in change.items():
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()  # looks at the folder when first used, only
-        if change is settings:
-            yield
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    compilation_cache.reset_cache()  # looks at the folder when first used, only
 
 
 @pytest.fixture(scope="session")

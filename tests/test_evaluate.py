@@ -15,6 +15,7 @@ from caper_jax.data.cloud import sample_points
 from caper_jax.data.hdf5 import Hdf5Dataset, write
 from caper_jax.errors import CaperError
 from caper_jax.evaluation import protocol, report
+from caper_jax.evaluation.metrics import PoseErrors
 
 BOX = categories.get("box")
 FRAMES = 21
@@ -223,6 +224,19 @@ def test_the_worst_frames_are_named_and_drawn(path, tmp_path, monkeypatch, capsy
     assert "worst.png" in lines[-1] and (tmp_path / "worst.png").read_bytes()[:4] == b"\x89PNG"
     assert run(path, tmp_path, "--worst", "2", "--predictor", "truth") == 2
     assert "leave out --predictor" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["eyeglasses", "robotarm"])
+def test_tables_of_long_names_fit_a_terminal_and_say_what_is_turned(name):
+    category = categories.get(name)
+    turn = np.full((4, category.num_parts), 12.3)
+    turn[0] = 123.4
+    others, joints = np.full_like(turn, 0.3), np.full((4, category.num_joints), 0.3)
+    tables = report.error_tables(PoseErrors(turn, *[others] * 4, *[joints] * 3), category)
+    lines = report.format_tables(tables)
+    assert max(map(len, lines)) <= 80
+    said = " ".join(lines[category.num_parts + 1 : lines.index("")])
+    assert said == "over 30 deg: " + ", ".join(f"{part} 25.0 %" for part in category.parts)
 
 
 def test_frames_that_fail_are_counted_not_dropped(path, tmp_path):

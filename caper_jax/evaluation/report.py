@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -211,20 +212,20 @@ def _format_occlusion(bins: list[dict[str, Any]]) -> list[str]:
 
 def format_tables(tables: dict[str, Any]) -> list[str]:
     """Lines of the tables of parts and joints that ``error_tables`` gives, mean / median."""
-    above = f"> {TURNED_DEG:.0f} deg"
-    rows = [["part", "rotation [deg]", above, "translation [mm]", "IoU full", "IoU size"]]
+    rows = [["part", "rotation [deg]", "translation [mm]", "IoU full", "IoU size"]]
     for part in tables["parts"]:
         rows.append(
             [
                 part["name"],
                 _cell(part["rotation_deg"], 1, 2),
-                f"{100 * part['turned']:.1f} %",
                 _cell(part["translation_m"], 1000, 1),
                 _cell(part["iou_full"], 1, 3),
                 _cell(part["iou_size"], 1, 3),
             ]
         )
-    lines = [*align(rows), ""]
+    turned = ", ".join(f"{part['name']} {100 * part['turned']:.1f} %" for part in tables["parts"])
+    # A column more, and the table would be too wide.
+    lines = [*align(rows), *textwrap.wrap(f"over {TURNED_DEG:.0f} deg: {turned}", 80), ""]
     rows = [["joint", "axis [deg]", "pivot [mm]", "state"]]
     for joint, part in zip(tables["joints"], tables["parts"][1:], strict=True):
         metres = joint["state_unit"] == "metres"
