@@ -147,8 +147,7 @@ class Estimator:
         or exactly zero are left out. Inside jit, grad or vmap the array goes through unchanged.
 
         Args:
-          points: [N, 3] or [B, N, 3] metres, camera frame (OpenCV); in raster order if they come
-            from an image.
+          points: [N, 3] or [B, N, 3] metres, camera frame (OpenCV), in any order.
 
         Returns:
           Prediction with the leading axes of ``points``.

@@ -31,9 +31,10 @@ FRAME = "camera, OpenCV: x right, y down, z forward"
 ANY_BATCH = "batch"  # stands for the size in shapes that leave it open
 
 _SAMPLING = (
-    "leave out points that are NaN, infinite or exactly zero (of an image: keep the raster order), "
-    f"ask for {MIN_POINTS} or more of the remaining n, and take those at floor((i + 0.5) n / "
-    "num_points), i = 0 .. num_points - 1"
+    "leave out points that are NaN, infinite or exactly zero, ask for "
+    f"{MIN_POINTS} or more of the remaining n, sort them into some 32 rows of the image, within a "
+    "row by columns, and take those at floor((i + 0.5) n / num_points), i = 0 .. num_points - 1; "
+    "the order of the points taken does not matter"
 )
 # Output -> (unit, meaning). K parts and J joints in the manifest's order; part 0 is the root.
 _OUTPUTS = {

@@ -14,6 +14,7 @@ from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.geometry import se3
 from caper_jax.geometry.directions import rotation_from_directions
+from caper_jax.geometry.scan import as_before, in_order, scan_order
 from caper_jax.networks.canonical import canonicalise, multiply, rotate, transpose
 from caper_jax.networks.caper import (
     NetworkConfig,
@@ -52,7 +53,7 @@ def read(variables: dict[str, Any], cloud, category: Category, network: NetworkC
 
     Args:
       variables: see ``estimate``.
-      cloud: [B, N, 3] viewing frame, network units.
+      cloud: [B, N, 3] viewing frame, network units; in any order.
       category, network: static.
     """
 
@@ -61,6 +62,8 @@ def read(variables: dict[str, Any], cloud, category: Category, network: NetworkC
         return module.apply(own, cloud, train=False, space=space)
 
     unit = category.unit
+    order = scan_order(cloud)
+    cloud = in_order(cloud, order)
     space = shared_neighbourhoods(network, cloud)
     root = apply("root", RootNetwork(network), cloud)
     rotation, degenerate = rotation_from_directions(
@@ -93,7 +96,7 @@ def read(variables: dict[str, Any], cloud, category: Category, network: NetworkC
             size=jnp.maximum(mean_size + parts.size, SMALLEST_SIZE * mean_size),
             center=jnp.asarray(category.mean_center) * unit + parts.center,
         ),
-        segmentation=parts.segmentation,
+        segmentation=as_before(parts.segmentation, order),
         confidence=root.confidence,
         degenerate=degenerate,
         evidence=confidence.evidence(root.confidence, moved, parts.segmentation),

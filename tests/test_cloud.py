@@ -25,7 +25,7 @@ def slope():
     return np.tile(depth, (SHAPE[0], 1)).astype(np.float32)
 
 
-def test_points_project_onto_their_pixels_in_raster_order():
+def test_points_project_onto_their_pixels():
     depth = slope()
     mask = np.zeros(SHAPE, bool)
     mask[20:90, 30:120] = True
@@ -34,7 +34,7 @@ def test_points_project_onto_their_pixels_in_raster_order():
     projected = cloud.points @ K.T.astype(np.float32)
     np.testing.assert_allclose(projected[:, 1::-1] / projected[:, 2:], cloud.pixels, atol=1e-4)
     np.testing.assert_allclose(cloud.points[:, 2], 1 + cloud.points[:, 0] / 2, atol=1e-6)
-    assert (np.diff(cloud.index) > 0).all()
+    assert len(np.unique(cloud.index)) == 500
     np.testing.assert_array_equal(cloud.index, cloud.pixels @ [SHAPE[1], 1])
     assert (cloud.available, cloud.dropped) == (70 * 90, 0)
 
@@ -71,6 +71,23 @@ def test_picks_cover_a_large_object_evenly(width):
         *cloud.pixels.T, bins=(16, 16), range=((10, 266), (40, 40 + width))
     )
     assert counts.min() >= 2 and counts.max() <= 6
+
+
+def test_a_raw_cloud_is_picked_evenly_in_any_order():
+    """Better than by chance, which is what every so-manieth of unordered points would be."""
+    raster = cloud_from_depth(slope(), np.ones(SHAPE, bool), K, num_points=100_000).points
+    assert len(raster) == 100_000  # every pixel, some of them repeated
+    raster = np.unique(raster, axis=0)
+    mixed = np.random.default_rng(0).permutation(raster)
+    one, other = (sample_points(points, 1024).points for points in (raster, mixed))
+    assert len(set(map(tuple, one)) & set(map(tuple, other))) > 1000
+    for picked in (one, other, mixed[:1024]):
+        pixels = (picked @ K.T.astype(np.float32))[:, 1::-1] / picked[:, 2:]
+        counts, _, _ = np.histogram2d(*pixels.T, bins=(12, 16), range=((0, 120), (0, 160)))
+        if picked is not one and picked is not other:
+            assert counts.min() < 2 or counts.max() > 9  # what chance makes of it
+        else:
+            assert counts.min() >= 3 and counts.max() <= 8
 
 
 def test_thin_objects_keep_enough_pixels():

@@ -141,6 +141,22 @@ def test_any_number_of_points_without_recompiling(cabinet):
     jax.tree.map(lambda one, many: np.testing.assert_array_equal(one, many[0]), single, whole)
 
 
+def test_the_order_of_the_points_does_not_matter(cabinet):
+    """All of it: poses are the same, and each point keeps its part."""
+    points = clouds(4)
+    shuffle = np.random.default_rng(1).permutation(points.shape[1])
+    one, other = cabinet(points), cabinet(points[:, shuffle])
+    np.testing.assert_array_equal(other.points, points[:, shuffle])
+    np.testing.assert_array_equal(other.labels, np.asarray(one.labels)[:, shuffle])
+    assert len(np.unique(one.labels)) > 1
+    close = partial(np.testing.assert_allclose, atol=1e-5)
+    jax.tree.map(close, other.pose, one.pose)
+    # A larger cloud is sampled the same, too.
+    many = clouds(1, 1000)[0]
+    mixed = np.random.default_rng(1).permutation(many)
+    jax.tree.map(close, cabinet(mixed), cabinet(many))
+
+
 def test_points_without_a_measurement_are_left_out(cabinet):
     cloud = clouds(1, 60)[0]
     holes = np.insert(cloud, [0, 10, 59], np.nan, axis=0)

@@ -83,6 +83,17 @@ def most(right) -> bool:
 
 
 class TestShipped:
+    def test_labels_keep_the_order_of_the_points(self, player):
+        points = player.videos.points[0, 1]
+        shuffle = np.random.default_rng(1).permutation(len(points))
+        player.begin(0)
+        one, _ = player.show(0, 1)
+        player.begin(0)
+        other, _ = player.show(0, 1, points[shuffle])
+        # Rounding of a mean may move a point into the next row of the scan, but hardly any.
+        assert (other.labels == one.labels[shuffle]).mean() > 0.98
+        assert (other.labels == one.labels).mean() < 0.9
+
     def test_a_given_first_pose_is_followed(self, player):
         for video in range(VIDEOS):
             player.begin(video)

@@ -9,6 +9,7 @@ import numpy as np
 
 from caper_jax.data.images import read_array
 from caper_jax.errors import CaperError
+from caper_jax.geometry.scan import scan_order
 
 MIN_POINTS = 16
 # Lines per side over the object's box: the generator casts its rays on such a grid.
@@ -19,7 +20,7 @@ _FARTHEST_M = 50.0
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points picked from a depth image or a larger cloud, in the order of the source.
+    """Points of a depth image or a cloud: an even pick in scan order, or all in their own order.
 
     Attributes:
       points: [N, 3] float32 metres, camera frame.
@@ -40,7 +41,7 @@ def systematic_indices(available: int, num_points: int, seed: int | None = None)
     """Evenly spread picks ``floor((i + u) n / N)``: no sort, no repeat unless n < N.
 
     Args:
-      available: n, number of points to pick from, in raster order.
+      available: n, number of points to pick from, in scan order.
       num_points: N, number of picks.
       seed: draws u from [0, 1); None takes u = 1/2.
 
@@ -52,6 +53,12 @@ def systematic_indices(available: int, num_points: int, seed: int | None = None)
     return np.minimum(ranks.astype(np.int64), available - 1)
 
 
+def _even_pick(points: np.ndarray, num_points: int, seed: int | None) -> np.ndarray:
+    """``systematic_indices`` along the scan order of points [n, 3]; along their own if n <= N."""
+    picked = systematic_indices(len(points), num_points, seed)
+    return picked if len(points) <= num_points else scan_order(points)[picked]
+
+
 def cloud_from_depth(
     depth: np.ndarray,
     mask: np.ndarray,
@@ -60,10 +67,10 @@ def cloud_from_depth(
     seed: int | None = None,
     radius: float | None = None,
 ) -> Cloud:
-    """Back-projects the masked pixels and picks ``num_points`` of them in raster order.
+    """Back-projects the masked pixels and picks ``num_points`` of them, evenly.
 
-    Large objects are first thinned to a grid of rows and columns: an even pick along the raster
-    of a full image would fall on few columns wherever its stride fits the width of the object.
+    Large objects are first thinned to a grid of rows and columns: of all the pixels of an image
+    sorting takes longer than the estimate.
 
     Args:
       depth: [H, W] metres; zero, NaN and infinity are dropped and counted.
@@ -106,7 +113,7 @@ def cloud_from_depth(
     kept = np.arange(len(points)) if radius is None else _near(points, radius)
     _check_count(len(kept), f"of {len(valid)} masked pixels")
     lattice = kept[_on_grid(rows[kept], columns[kept], num_points)]
-    picked = lattice[systematic_indices(len(lattice), num_points, seed)]
+    picked = lattice[_even_pick(points[lattice], num_points, seed)]
     pixels = np.stack([rows[picked], columns[picked]], axis=-1)
     return Cloud(
         points=points[picked],
@@ -160,7 +167,7 @@ def sample_points(
     radius: float | None = None,
     where: str = "points",
 ) -> Cloud:
-    """Picks ``num_points`` of a raw cloud, in its own order.
+    """Picks ``num_points`` of a raw cloud in any order, evenly over the image.
 
     Args:
       points: [N, 3] metres, camera frame; rows with NaN or infinity, and rows of zeros (no
@@ -199,7 +206,7 @@ def sample_points(
     if radius is not None:
         kept = kept[_near(cast[kept], radius)]
         _check_count(len(kept), f"of {len(points)} points in {where}")
-    index = kept[systematic_indices(len(kept), num_points, seed)]
+    index = kept[_even_pick(cast[kept], num_points, seed)]
     return Cloud(
         points=cast[index],
         pixels=np.zeros((0, 2), np.int32),

@@ -15,6 +15,7 @@ from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.cloud import MIN_POINTS, systematic_indices
 from caper_jax.data.schema import Dataset, Frame, pose_problems
 from caper_jax.errors import CaperError
+from caper_jax.geometry.scan import scan_order
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,7 @@ class Loader:
 
 
 def _ready(frame: Frame, dataset: Dataset) -> LabelledClouds | None:
-    """What training needs of a frame, checked; None if it shows too little."""
+    """What training needs of a frame, checked, in scan order; None if it shows too little."""
     where = f"frame {frame.name!r} of {dataset.category.name}"
     if frame.truth is None:
         raise CaperError(f"{where} has no ground truth to train on")
@@ -204,8 +205,10 @@ def _ready(frame: Frame, dataset: Dataset) -> LabelledClouds | None:
     if usable.sum() < MIN_POINTS:
         return None
     labels = np.full(len(frame.points), -1) if frame.labels is None else frame.labels
+    points, labels = frame.points[usable].astype(np.float32), labels[usable].astype(np.int32)
+    order = scan_order(points)
     return LabelledClouds(
-        points=frame.points[usable].astype(np.float32),
-        labels=labels[usable].astype(np.int32),
+        points=points[order],
+        labels=labels[order],
         pose=jax.tree.map(lambda array: np.asarray(array, np.float32), frame.truth),
     )

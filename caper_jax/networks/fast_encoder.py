@@ -35,7 +35,7 @@ class FastEncoderConfig:
     """
 
     centers: int = 128
-    stride: int = 2
+    stride: int = 1
     scales: tuple[float, ...] = (0.1, 0.2, 0.4)
     width: int = 128
     blocks: int = 2

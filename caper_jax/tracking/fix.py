@@ -12,6 +12,7 @@ import numpy as np
 from caper_jax.articulation.category import Category
 from caper_jax.estimator import estimate
 from caper_jax.geometry import linalg, se3
+from caper_jax.geometry.scan import as_before, in_order, scan_order
 from caper_jax.networks.canonical import canonicalise
 from caper_jax.networks.caper import NetworkConfig, PartsNetwork
 from caper_jax.networks.increment import increment_transform
@@ -61,12 +62,15 @@ def measure(
       category, network: static.
     """
     own = {name: collection["parts"] for name, collection in variables.items()}
-    cloud = canonicalise(points[None], reference[None, :3, :3], reference[None, :3, 3])
+    order = scan_order(points)[None]
+    cloud = in_order(points[None], order)
+    cloud = canonicalise(cloud, reference[None, :3, :3], reference[None, :3, 3])
     module = PartsNetwork(network, category.num_parts)
     output: Any = module.apply(own, cloud, train=False)
     axis, pivot = vote(cloud, output.heatmap, output.offset, output.direction)
     increment = increment_transform(output.increment[0], network.increment)
-    predicted = output.segmentation[0].argmax(-1).astype(jnp.int32)
+    segmentation = as_before(output.segmentation, order)[0]
+    predicted = segmentation.argmax(-1).astype(jnp.int32)
     unit = category.unit
     constants = Constants(
         axis=axis[0],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import jax
@@ -14,6 +14,7 @@ from caper_jax.articulation.equivalence import is_ambiguous, second_labels, seco
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.geometry import se3, so3
 from caper_jax.geometry.directions import rotation_from_directions
+from caper_jax.geometry.scan import in_order, scan_order
 from caper_jax.networks.canonical import (
     canonicalise,
     multiply,
@@ -99,7 +100,7 @@ class Task:
         Args:
           params: {"root", "parts"}.
           model_state: mutable collections by name, each {"root", "parts"}.
-          batch: data.synthetic.scene.Batch, metres, camera frame.
+          batch: data.synthetic.scene.Batch, metres, camera frame; points in any order.
           key: PRNG key.
           progress: fraction of the run done (unused).
 
@@ -108,6 +109,12 @@ class Task:
         """
         del progress
         keys = jax.random.split(key, 4)
+        order = scan_order(batch.points)
+        batch = replace(
+            batch,
+            points=in_order(batch.points, order),
+            labels=in_order(batch.labels[..., None], order)[..., 0],
+        )
         unit = self.category.unit
         seen = batch.points
         if self.config.root_input == "root":

@@ -20,6 +20,7 @@ from caper_jax.data.synthetic.camera import camera_pose, draw_camera
 from caper_jax.data.synthetic.caster import FAR, nearest_part, part_depths, projected_bounds
 from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.data.synthetic.surroundings import add_clutter, spill_on_table, table_depth
+from caper_jax.geometry.scan import grid_scan_order
 
 _MARGIN = 0.04  # of the object's projected box, on each side
 
@@ -29,7 +30,7 @@ class Batch:
     """Labelled frames.
 
     Attributes:
-      points: [B, N, 3] metres, camera frame, in raster order.
+      points: [B, N, 3] metres, camera frame, in scan order.
       labels: [B, N] int32 part of each point, -1 for residue.
       pose: ArticulatedPose with leading axis B.
       visible: [B, K] int32 pixels of each part in the mask, before sampling.
@@ -47,15 +48,17 @@ class Batch:
 
 
 def _systematic(key, hit, count: int):
-    """Indices [count] of hits, evenly spread in raster order, repeating when there are too few.
+    """Raster indices [count] of hits [G, G], evenly spread in scan order; repeating if too few.
 
     The r-th pick is hit number floor((r + u) n / count): no sort, uniform over the image.
     """
-    running = jnp.cumsum(hit)
+    order = jnp.asarray(grid_scan_order(hit.shape[0]), jnp.int32)
+    running = jnp.cumsum(hit.ravel()[order])
     total = running[-1]
     offset = jax.random.uniform(key, (count,))
     rank = jnp.floor((jnp.arange(count) + offset) * total / count).astype(jnp.int32) + 1
-    return jnp.clip(jnp.searchsorted(running, rank, side="left"), 0, hit.shape[0] - 1)
+    place = jnp.clip(jnp.searchsorted(running, rank, side="left"), 0, order.shape[0] - 1)
+    return order[place]
 
 
 def draw_state_and_poses(key, instance: Bank, category: Category):
@@ -152,7 +155,7 @@ def observe(
     seen = jnp.where(seen.any(), seen, hit)
 
     # Only the chosen pixels are measured: random numbers are what costs on a CPU.
-    index = _systematic(keys.pick, seen.ravel(), config.num_points)
+    index = _systematic(keys.pick, seen, config.num_points)
     chosen = jax.tree.map(lambda image: image.ravel()[index], surface)
     points = sensors.measure(keys.noise, sensor, chosen, (flat[0][index], flat[1][index]))
     labels = part.ravel()[index]

@@ -22,6 +22,7 @@ from caper_jax.data.synthetic.scene import Batch, Keys, draw_state_and_poses
 from caper_jax.data.urdf.canonical import ImportedObject
 from caper_jax.data.urdf.meshes import NEEDS_MESH, Mesh
 from caper_jax.errors import CaperError
+from caper_jax.geometry.scan import grid_scan_order
 
 
 class PartCaster:
@@ -218,9 +219,10 @@ def _observe(
     depth = np.where(hit, nearest, 0.0).astype(np.float32).reshape(image)
     rays = tuple(ray.astype(np.float32) for ray in rays)
     sensor, surface, seen = _sense(keys, frame, mix, depth, hit.reshape(image), rays)
-    found = np.flatnonzero(np.asarray(seen))
-    found = found if len(found) else np.flatnonzero(hit)
-    # Evenly spread in raster order, repeating when there are too few.
+    shown = np.asarray(seen).ravel()
+    order = grid_scan_order(image[0])
+    found = order[(shown if shown.any() else hit)[order]]
+    # Evenly spread in scan order, repeating when there are too few.
     index = found[((np.arange(len(pick)) + pick) * len(found) / len(pick)).astype(np.int64)]
     chosen = jax.tree.map(lambda values: np.asarray(values).ravel()[index], surface)
     points = _measure(keys, frame, sensor, chosen, (rays[0].ravel()[index], rays[1].ravel()[index]))
