@@ -17,9 +17,9 @@ from caper_jax.data.synthetic.bank import build_bank, draw_models
 from caper_jax.data.synthetic.caster import FAR, cast
 from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.data.synthetic.render import render_image, write_frame
-from caper_jax.data.synthetic.scene import Generator, draw_state_and_poses
+from caper_jax.data.synthetic.scene import Generator, draw_state_and_poses, systematic
 from caper_jax.errors import CaperError
-from caper_jax.geometry.scan import scan_order
+from caper_jax.geometry.scan import grid_scan_order
 from caper_jax.geometry.solid_bounds import bounds
 
 NAMES = categories.names()
@@ -116,13 +116,17 @@ def test_points_lie_on_their_part(clean):
     assert outside_part(batch, batch.labels).max() < 1e-4
 
 
-def test_points_come_in_scan_order(clean):
-    """But for what the object's own shape makes of rows and columns, and rounding at their ends."""
-    _, _, batch = clean
-    place = np.argsort(scan_order(batch.points), axis=1)
-    moved = np.abs(place - np.arange(batch.points.shape[1]))
-    # 512 points in no order would be 171 places off; those in raster order some 20.
-    assert np.median(moved) < 8
+def test_picks_follow_one_another_evenly_along_the_scan():
+    hit = np.random.default_rng(0).random((64, 64)) < 0.4
+    order = grid_scan_order(64)
+    hits = order[hit.ravel()[order]]
+    for count in (300, 5000):
+        picked = np.asarray(systematic(jax.random.key(0), jnp.asarray(hit), count))
+        place = np.argsort(hits)[np.searchsorted(np.sort(hits), picked)]
+        np.testing.assert_array_equal(hits[place], picked)
+        step = len(hits) / count
+        off = place - step * np.arange(count)  # the r-th lies in the r-th of equal pieces
+        assert (off > -1).all() and (off <= step).all()
 
 
 def test_part_poses_follow_the_joints(clean):

@@ -47,7 +47,7 @@ class Batch:
     visibility: Any = None
 
 
-def _systematic(key, hit, count: int):
+def systematic(key, hit, count: int):
     """Raster indices [count] of hits [G, G], evenly spread in scan order; repeating if too few.
 
     The r-th pick is hit number floor((r + u) n / count): no sort, uniform over the image.
@@ -155,7 +155,7 @@ def observe(
     seen = jnp.where(seen.any(), seen, hit)
 
     # Only the chosen pixels are measured: random numbers are what costs on a CPU.
-    index = _systematic(keys.pick, seen, config.num_points)
+    index = systematic(keys.pick, seen, config.num_points)
     chosen = jax.tree.map(lambda image: image.ravel()[index], surface)
     points = sensors.measure(keys.noise, sensor, chosen, (flat[0][index], flat[1][index]))
     labels = part.ravel()[index]
