@@ -253,12 +253,17 @@ def test_local_moments_are_weighted_means_and_covariances():
 
 
 def test_fast_encoder_interpolates_its_centres():
-    config = FastEncoderConfig(centers=16, stride=1, scales=(0.1,), width=4, blocks=1, last=4)
+    config = FastEncoderConfig(
+        centers=8, centers_in_use=16, scales=(0.1,), width=4, blocks=1, last=4
+    )
     module = FastEncoder(config)
-    for count, centers in ((64, 16), (10, 10)):  # fewer points than centres: all of them
+    for count, train, centers in (
+        *((64, True, 8), (64, False, 16)),
+        (10, False, 10),  # fewer points than centres: all of them
+    ):
         points = normal(2, count, 3)
         shapes = jax.eval_shape(
-            lambda x: module.init_with_output(jax.random.key(0), x, False)[0], points
+            lambda x, train=train: module.init_with_output(jax.random.key(0), x, train)[0], points
         )
         assert shapes.levels[0].features.shape == (2, centers, 4)
         assert shapes.levels[0].upsample.shape == (2, count, centers)

@@ -15,7 +15,9 @@ from caper_jax.networks.hs_encoder import HSEncoderConfig
 from caper_jax.training.task import LossConfig, Task
 
 HS = HSEncoderConfig(channels=(4, 4, 8, 8, 16), neighbours=4, supports=2)
-FAST = FastEncoderConfig(centers=16, stride=1, scales=(0.2, 0.4), width=8, blocks=1, last=8)
+FAST = FastEncoderConfig(
+    centers=16, centers_in_use=16, scales=(0.2, 0.4), width=8, blocks=1, last=8
+)
 
 
 def network(encoder: str = "fast", pool_first: bool = False, **changes: Any) -> NetworkConfig:

@@ -25,7 +25,9 @@ class FastEncoderConfig:
     """Sizes of the fast encoder.
 
     Attributes:
-      centers: points that get local moments; every (N / centers)-th of the cloud.
+      centers: points that get local moments in training; every (N / centers)-th of the cloud.
+      centers_in_use: the same when a trained model is used: with more of them the same weights
+        are more accurate.
       stride: the moments are taken over every stride-th point.
       scales: standard deviations of the Gaussian windows, relative to the cloud's radius.
       width: features per centre.
@@ -35,6 +37,7 @@ class FastEncoderConfig:
     """
 
     centers: int = 128
+    centers_in_use: int = 256
     stride: int = 1
     scales: tuple[float, ...] = (0.1, 0.2, 0.4)
     width: int = 128
@@ -94,7 +97,8 @@ class FastEncoder(nn.Module):
         def norm_relu(features):
             return nn.relu(BatchNorm(use_running_average=not train, momentum=0.9)(features))
 
-        centers = points[:, :: max(1, points.shape[1] // config.centers)][:, : config.centers]
+        count = config.centers if train else config.centers_in_use
+        centers = points[:, :: max(1, points.shape[1] // count)][:, :count]
         middle = points.mean(axis=1, keepdims=True)
         radius = jnp.sqrt(((points - middle) ** 2).sum(-1).mean(-1) + 1e-8)
         window = points[:, :: config.stride]
