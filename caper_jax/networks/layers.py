@@ -27,7 +27,8 @@ def after(done: jax.Array, array: jax.Array) -> jax.Array:
     return jnp.where(jnp.isfinite(done), array, jnp.nan)
 
 
-_TIE = 1e-5  # of the maximum: more than its entries differ by where they are computed twice
+# Units of rounding of the maximum: more than its entries differ by where they are computed twice.
+_TIE = 80
 
 
 @jax.custom_jvp
@@ -44,7 +45,8 @@ def max_over_points(features):
 def _max_over_points_jvp(primals, tangents):
     (features,), (change,) = primals, tangents
     top = features.max(axis=1, keepdims=True)
-    reached = ~(features < top - _TIE * jnp.abs(top))  # true of NaN, which is passed on
+    tie = _TIE * jnp.finfo(features.dtype).eps
+    reached = ~(features < top - tie * jnp.abs(top))  # true of NaN, which is passed on
     count = jnp.maximum(reached.sum(axis=1), 1)
     return top[:, 0], jnp.where(reached, change, 0.0).sum(axis=1) / count
 
