@@ -137,13 +137,12 @@ def test_fitting_writes_a_model_that_knows_sizes_better(tmp_path, monkeypatch):
     folder = tmp_path / "box"
     shutil.copytree(shipped_weights() / "box", folder)
     data = GeneratorConfig(instances=200, grid=48, num_points=1024, noise=("none",))
-    fitting.add_sides(folder, "box", data, 64, 2048)
+    fitting.add_sides(folder, "box", data, 64, 4096)
     card, variables = read_model(folder)
     assert card["run"]["network"]["sides_width"] == 64 and "calibration" not in card
     assert variables["params"]["sides"]["Dense_0"]["kernel"].shape[1] == 64
     fitted, batch = load("box", folder), frames(BOX)
-    # A network that says nothing leaves them as they are: the ratio would be 1.
-    assert errors(fitted, batch)[1] < 0.97 * errors(without(fitted), batch)[1]
+    assert errors(fitted, batch)[1] < 0.95 * errors(without(fitted), batch)[1]
 
 
 def test_too_few_frames_are_refused():

@@ -24,10 +24,8 @@ def sample(points):  # without what is no measurement, as many points as the mod
     points = points[np.isfinite(points).all(-1) & (points != 0).any(-1)]
     assert len(points) >= 16, f"only {len(points)} usable points"
     if len(points) > SHAPE[1]:  # into rows of the image, to and fro
-        x, y, z = points.T
-        z = np.maximum(z, max(0.5 * z.mean(), 1e-6))
-        x, y = ((v - v.mean()) / max(v.std(), 1e-9) for v in (x / z, y / z))
-        row = np.floor(y * 32 * 12**-0.5)
+        x, y = (points[:, :2] / np.maximum(points[:, 2:], max(points[:, 2].mean() / 2, 1e-6))).T
+        row = np.floor((y - y.mean()) / max(y.std(), 1e-9) * 32 * 12**-0.5)
         points = points[np.lexsort((np.where(row % 2 == 1, -x, x), row))]
     return points[((np.arange(SHAPE[1]) + 0.5) * len(points) / SHAPE[1]).astype(int)]
 
