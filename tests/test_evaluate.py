@@ -15,6 +15,7 @@ from caper_jax.data.cloud import sample_points
 from caper_jax.data.hdf5 import Hdf5Dataset, write
 from caper_jax.errors import CaperError
 from caper_jax.evaluation import protocol, report
+from caper_jax.evaluation.breakdown import by_opening
 from caper_jax.evaluation.metrics import PoseErrors
 from caper_jax.geometry.scan import scan_order
 
@@ -106,6 +107,38 @@ def test_errors_by_occlusion(tmp_path, estimator, capsys):
         assert lid["frames"] == (FRAMES if number == 0 else 0)
         assert ("translation_m" in lid) == (number == 0)
     assert "80-100 %" in capsys.readouterr().out
+
+
+def test_errors_by_opening(path, tmp_path, estimator, capsys):
+    assert run(path, tmp_path) == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    saved = np.load(tmp_path / "predictions.npz")
+    distance = np.linalg.norm(saved["t"] - saved["truth_t"], axis=-1)
+    low, high = BOX.joints[0].limits
+    places = np.digitize((saved["truth_joint_state"][:, 0] - low) / (high - low), [0.05, 0.25])
+    assert set(places) >= {1, 2}
+    for number, content in enumerate(metrics["by_opening"]):
+        for part, metres in zip(content["parts"], distance[places == number].T, strict=True):
+            assert part["frames"] == len(metres)
+            if len(metres):
+                assert part["translation_m"]["mean"] == pytest.approx(metres.mean(), rel=1e-4)
+    assert "25-100 %" in capsys.readouterr().out
+
+
+def test_the_joint_that_is_most_open_counts():
+    """Bounds belong to the bin above them, and states beyond a limit count as the limit."""
+    drawer = categories.get("drawer")
+    low, high = drawer.joints[1].limits
+    shares = np.array([-0.1, 0.0, 0.04, 0.05, 0.24, 0.25, 1.0, 1.1])
+    states = np.zeros((len(shares), 3))
+    states[:, 1] = low + shares * (high - low)
+    values = np.arange(4.0 * len(shares)).reshape(-1, 4)
+    errors = PoseErrors(**{f.name: values for f in dataclasses.fields(PoseErrors)})
+    bins = by_opening(errors, states, drawer)
+    for content, rows in zip(bins, (values[:3], values[3:5], values[5:]), strict=True):
+        assert [part["frames"] for part in content["parts"]] == [len(rows)] * 4
+        means = [part["rotation_deg"]["mean"] for part in content["parts"]]
+        np.testing.assert_allclose(means, rows.mean(0))
 
 
 def test_every_figure_can_be_computed_from_the_predictions(path, tmp_path, estimator):

@@ -11,7 +11,8 @@ import numpy as np
 
 from caper_jax.articulation.category import Category
 from caper_jax.errors import CaperError
-from caper_jax.evaluation.report import align, format_tables
+from caper_jax.evaluation.report import format_tables
+from caper_jax.evaluation.summaries import align
 from caper_jax.evaluation.tracking import Start, Track
 from caper_jax.tracking.config import TrackerConfig
 from caper_jax.tracking.step import Tracked

@@ -7,12 +7,13 @@ from typing import Any
 from caper_jax import categories
 from caper_jax.evaluation.protocol import evaluate, model_predictor
 from caper_jax.evaluation.report import summarise
+from caper_jax.evaluation.summaries import cell
 from caper_jax.evaluation.tables import comparison, runs, trainings
 from caper_jax.evaluation.tables.frames import open_frames
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.paper import TABLES, Figures
 from caper_jax.evaluation.tables.render import Report, Table, number
-from caper_jax.evaluation.tables.static import joint_cells, pair
+from caper_jax.evaluation.tables.static import joint_cells
 
 # Name -> the settings that take the idea away.
 VARIANTS = {
@@ -98,8 +99,8 @@ def variant_rows(
         rows.append(
             [
                 *(category, part["name"], variant, str(seed)),
-                *(number(turn, 1), pair(part["rotation_deg"], 1.0, 2)),
-                *(number(shift, 2), pair(part["translation_relative"], 100.0, 2)),
+                *(number(turn, 1), cell(part["rotation_deg"], 1.0, 2)),
+                *(number(shift, 2), cell(part["translation_relative"], 100.0, 2)),
                 *joint_cells(tables, index),
             ]
         )

@@ -16,12 +16,12 @@ from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator
 from caper_jax.evaluation.protocol import Evaluation, Predictor, evaluate, model_predictor
 from caper_jax.evaluation.report import summarise
+from caper_jax.evaluation.summaries import cell
 from caper_jax.evaluation.tables import runs, trainings
 from caper_jax.evaluation.tables.frames import open_frames
 from caper_jax.evaluation.tables.options import Options
 from caper_jax.evaluation.tables.paper import PM_DIAGONAL_M, ROOT_INPUT
 from caper_jax.evaluation.tables.render import Report, Scatter, Table, number
-from caper_jax.evaluation.tables.static import pair
 from caper_jax.geometry import so3
 
 _FRAMES = 1000
@@ -79,7 +79,7 @@ def run(name: str, options: Options) -> Report:
                 else:
                     errors = _rotation_errors(found, dataset.category.directions)
                     row |= {f"{of}_deg": _mean_median(values) for of, values in errors.items()}
-                    cells = [pair(row[f"{of}_deg"], 1.0, 2) for of in errors]
+                    cells = [cell(row[f"{of}_deg"], 1.0, 2) for of in errors]
                     rows.append([key, kind, str(seed), *cells])
                     if seed == 0:
                         panels[kind] = errors["yaw"], errors["pitch"], errors["roll"]
@@ -166,9 +166,9 @@ def _off(estimate: ArticulatedPose, truth: ArticulatedPose) -> np.ndarray:
 def _table7_row(category: str, kind: str, seed: int, root: dict[str, Any]) -> list[str]:
     turn, shift = ROOT_INPUT[category][kind]
     return [
-        *(category, kind, str(seed), number(turn, 1), pair(root["rotation_deg"], 1.0, 2)),
+        *(category, kind, str(seed), number(turn, 1), cell(root["rotation_deg"], 1.0, 2)),
         number(100 * shift / PM_DIAGONAL_M, 2),
-        pair(root["translation_relative"], 100.0, 2),
+        cell(root["translation_relative"], 100.0, 2),
     ]
 
 
@@ -185,7 +185,7 @@ def _rotation_errors(found: Evaluation, directions: tuple[str, str]) -> dict[str
 
 
 def _mean_median(errors: np.ndarray) -> dict[str, float | None]:
-    """Of the amounts, as ``pair`` takes them."""
+    """Of the amounts, as ``cell`` takes them."""
     return {"mean": float(np.abs(errors).mean()), "median": float(np.median(np.abs(errors)))}
 
 

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 
 from caper_jax import categories
+from caper_jax.evaluation.breakdown import share
 from caper_jax.evaluation.metrics import object_diagonal
 from caper_jax.evaluation.protocol import evaluate, model_predictor
-from caper_jax.evaluation.report import TURNED_DEG, summarise
+from caper_jax.evaluation.report import summarise
+from caper_jax.evaluation.summaries import TURNED_DEG, cell
 from caper_jax.evaluation.tables import comparison, runs
 from caper_jax.evaluation.tables.frames import open_frames
 from caper_jax.evaluation.tables.options import Options
@@ -22,6 +24,12 @@ SPREAD_HEADER = (
     *("category", "part", "truth", "rot [deg]", f"> {TURNED_DEG:.0f} deg [%]", "trans [mm]"),
     *("IoU size [%]", "IoU full [%]", "joint axis [deg]", "pivot [mm]", "state"),
 )
+
+OPENING_HEADER = (
+    *("category", "open by", "frames"),
+    *("root rot [deg]", f"> {TURNED_DEG:.0f} deg [%]", "root trans [mm]"),
+)
+_OPENING_TITLE = "The root by how far the most open joint is open, mean / median"
 
 
 def run(name: str, options: Options) -> Report:
@@ -39,6 +47,7 @@ def run(name: str, options: Options) -> Report:
     figures = {key: paper.categories[key] for key in options.chosen(paper.categories)}
     rows: list[list[str]] = []
     spreads: list[list[str]] = []
+    openings: list[list[str]] = []
     facts, result = [], {}
     for key, figure in figures.items():
         found = measure(key, options, paper.frames)
@@ -53,11 +62,13 @@ def run(name: str, options: Options) -> Report:
         )
         rows += comparison.rows(key, _LABEL, found, figure)
         spreads += spread_rows(key, _LABEL, found)
+        openings += opening_rows(key, found)
         if "up_to_symmetry" in found:
             spreads += spread_rows(key, f"{_LABEL}, up to symmetry", found["up_to_symmetry"])
     tables = [Table("Mean errors of one frame", HEADER, rows, comparison.LABELS)]
     if spreads:
         tables.append(Table("All errors, mean / median", SPREAD_HEADER, spreads, comparison.LABELS))
+        tables.append(Table(_OPENING_TITLE, OPENING_HEADER, openings, 1))
     return Report(
         title=paper.title,
         tables=tables,
@@ -106,14 +117,29 @@ def spread_rows(category: str, label: str, tables: dict[str, Any]) -> list[list[
     rows = []
     for index, part in enumerate(tables["parts"]):
         cells = [
-            pair(part["rotation_deg"], 1.0, 2),
+            cell(part["rotation_deg"], 1.0, 2),
             number(100 * part["turned"], 1),
-            pair(part["translation_m"], 1000.0, 1),
-            pair(part["iou_size"], 100.0, 1),
-            pair(part["iou_full"], 100.0, 1),
+            cell(part["translation_m"], 1000.0, 1),
+            cell(part["iou_size"], 100.0, 1),
+            cell(part["iou_full"], 100.0, 1),
         ]
         cells += joint_cells(tables, index)
         rows.append([category, part["name"], label, *cells])
+    return rows
+
+
+def opening_rows(category: str, found: dict[str, Any]) -> list[list[str]]:
+    """One row per bin of ``breakdown.by_opening`` that has frames."""
+    rows = []
+    for content in found["by_opening"]:
+        root = content["parts"][0]
+        if root["frames"]:
+            cells = [
+                cell(root["rotation_deg"], 1.0, 2),
+                number(100 * root["turned"], 1),
+                cell(root["translation_m"], 1000.0, 1),
+            ]
+            rows.append([category, share(content["opened"]), str(root["frames"]), *cells])
     return rows
 
 
@@ -123,17 +149,9 @@ def joint_cells(tables: dict[str, Any], part: int) -> list[str]:
         return ["-"] * 3
     joint = tables["joints"][part - 1]
     metres = joint["state_unit"] == "metres"
-    state = pair(joint["state"], 1000.0 if metres else 1.0, 2)
+    state = cell(joint["state"], 1000.0 if metres else 1.0, 2)
     return [
-        pair(joint["axis_deg"], 1.0, 2),
-        pair(joint["pivot_m"], 1000.0, 1),
+        cell(joint["axis_deg"], 1.0, 2),
+        cell(joint["pivot_m"], 1000.0, 1),
         f"{state} {'mm' if metres else 'deg'}",
     ]
-
-
-def pair(summary: dict[str, float | None], factor: float, digits: int) -> str:
-    """A cell ``mean / median``; "-" where the error has no meaning."""
-    mean, median = summary["mean"], summary["median"]
-    if mean is None or median is None:
-        return "-"
-    return f"{number(factor * mean, digits)} / {number(factor * median, digits)}"
