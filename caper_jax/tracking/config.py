@@ -41,8 +41,13 @@ class TrackerConfig:
         it; it does so where it fits its own boxes clearly better.
       sure: least confidence in both of the root's directions (Eq 18) at which a static estimate may
         correct or replace a track: from a closed drawer's back any side may be the front.
+      trial: frames after a start from the static estimator in which it is asked again, as long as
+        it is sure: its poses are averaged, and vote on turns.
+      vote: nats by which a static estimate that is a quarter or half turn from the track speaks for
+        that turn, and one that is not speaks against.
       turned: sum over frames of the log odds that the track is off by a quarter or half turn, at
-        which that turn is made; for networks with a turn head, at most 1 nat per frame.
+        which that turn is made: of stage II's, at most 1 nat per frame, for networks with a turn
+        head; or of the votes.
       misfit: mean distance of the points from their parts' boxes, relative to the object's
         diagonal, above which a frame contradicts the track.
       mismatch: share of unmatched points above which a frame contradicts the track.
@@ -64,6 +69,8 @@ class TrackerConfig:
     gate: float = 0.4
     patience: int = 3
     sure: float = 0.5
+    trial: int = 5
+    vote: float = 1.5
     turned: float = 2.0
     misfit: float = 0.03
     mismatch: float = 0.5

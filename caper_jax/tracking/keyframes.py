@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import flax.struct
 import jax
 import jax.numpy as jnp
 
 from caper_jax.geometry import linalg, se3, so3
-from caper_jax.networks.turns import TURNS, turned_pose
+from caper_jax.networks.turns import NUM_TURNS, TURNS, turn_between, turned_pose
 from caper_jax.tracking.config import TrackerConfig
 from caper_jax.tracking.fix import Fix, estimate_fix, measure, misfit, own_coordinates
 from caper_jax.tracking.registration import (
@@ -44,6 +47,27 @@ def contradicts(first, second, config: TrackerConfig):
     return (turn > jnp.radians(config.gate_deg)) | (shift > config.gate)
 
 
+@flax.struct.dataclass
+class Correction:
+    """What ``corrected`` makes of a frame.
+
+    Attributes:
+      fix: the pose.
+      variance: [3] of the state.
+      vote: [24] of the state.
+      asked: [] bool, whether the static estimator was asked.
+      sure: [] bool, whether its answer counts, as it was sure or the track long doubted.
+      replaced: [] bool, whether the track gave way altogether.
+    """
+
+    fix: Fix
+    variance: Any
+    vote: Any
+    asked: Any
+    sure: Any
+    replaced: Any
+
+
 def corrected(
     variables,
     points,
@@ -57,7 +81,7 @@ def corrected(
     category,
     network,
     config: TrackerConfig,
-):
+) -> Correction:
     """The pose of a frame that may be a keyframe: the track's, the estimator's, or between them.
 
     Where the track is in order, the static estimator's pose is weighed against it by their
@@ -75,13 +99,9 @@ def corrected(
         ``patience`` on it is doubted.
       turned: [] int32, by which turn the track is off; 0: by none.
       config: static.
-
-    Returns:
-      (fix, variance [3], whether the estimator was asked, whether its answer counts, as it was sure
-      or the track long doubted, whether that replaced the track).
     """
     doubted = doubtful >= config.patience
-    asked = state.lost | doubted
+    asked = state.lost | doubted | (state.trial > 0)
     if config.policy in ("fixed", "dynamic"):
         asked |= due
     static = jax.lax.cond(
@@ -89,13 +109,16 @@ def corrected(
         lambda: estimate_fix(variables, points, labels, category, network),
         lambda: tracked,
     )
+    sure = asked & ((static.sure >= config.sure) | (doubtful >= config.patience + _LONG))
+    vote = jnp.where(sure, turn_votes(state.vote, tracked.root, static.root, config), state.vote)
+    outvoted = (vote.max() > config.turned) & ~state.lost & (turned == 0)
+    turned = jnp.where(outvoted, vote.argmax().astype(jnp.int32), turned)
     reference = turned_pose(tracked.root, jnp.asarray(TURNS, tracked.root.dtype)[turned])
     static = jax.lax.cond(
         turned > 0,
         lambda: measure(variables, points, labels, reference, category, network),
         lambda: static,
     )
-    sure = asked & ((static.sure >= config.sure) | (doubtful >= config.patience + _LONG))
     better = misfit(static, points) < _BETTER * outside
     replaced = state.lost | (doubted & sure & better) | (turned > 0)
 
@@ -127,7 +150,29 @@ def corrected(
     # (1 - gain) grown, which would cancel where the gain is nearly one.
     left = jnp.where(gain > 0, gain * static_variance, grown)
     variance = jnp.where(replaced, static_variance, left)
-    return fix, variance, asked, sure, replaced
+    return Correction(fix, variance, vote, asked, sure, replaced)
+
+
+def turn_votes(before, tracked, static, config: TrackerConfig):
+    """Log odds [24] of turns of a track after a static estimate that differs from it.
+
+    What a closed object hides must not weigh more than what the open one then shows: there is a
+    least value, and the same for what stage II says.
+
+    Args:
+      before: [24] the votes so far.
+      tracked, static: [4, 4] root poses.
+      config: static.
+    """
+    index, left = turn_between(tracked[:3, :3], static[:3, :3])
+    votes = jnp.where(jnp.arange(NUM_TURNS) == index, config.vote, -config.vote).at[0].set(0.0)
+    votes = jnp.where(left < jnp.radians(config.gate_deg), votes, 0.0)
+    return added(before, votes, config)
+
+
+def added(before, votes, config: TrackerConfig):
+    """Log odds [24] of turns and what one frame adds, from a least value up."""
+    return jnp.maximum(before + votes, jnp.minimum(before, -config.turned))
 
 
 def make_keyframe(fix: Fix, points) -> Keyframe:

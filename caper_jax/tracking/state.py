@@ -82,7 +82,10 @@ class TrackerState:
       accepted: [] the misfit that the static estimator was asked about and could not better, so
         that objects of unusual size are not doubted again and again.
       doubtful: [] int32, frames in a row that disagreed with the track.
-      turn: [24] log odds, over the frames so far, that the track is off by a turn.
+      turn: [24] log odds, over the frames so far, that the track is off by a turn, as stage II sees
+        it.
+      vote: [24] likewise, by static estimates.
+      trial: [] int32, in so many further frames the static estimator is asked.
       lost: [] bool, the next frame with points starts afresh from the static estimator.
     """
 
@@ -98,4 +101,6 @@ class TrackerState:
     accepted: Any
     doubtful: Any
     turn: Any
+    vote: Any
+    trial: Any
     lost: Any

@@ -21,6 +21,7 @@ from caper_jax.tracking.energy import chamfer_energy
 from caper_jax.tracking.fix import Fix, averaged, diagonal, measure, misfit
 from caper_jax.tracking.joints import joints_from_poses
 from caper_jax.tracking.keyframes import (
+    added,
     contradicts,
     corrected,
     grown_surface,
@@ -102,6 +103,8 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
         accepted=jnp.zeros(()),
         doubtful=jnp.asarray(0, jnp.int32),
         turn=jnp.zeros(NUM_TURNS),
+        vote=jnp.zeros(NUM_TURNS),
+        trial=jnp.asarray(0, jnp.int32),
         lost=jnp.asarray(True),
     )
 
@@ -143,6 +146,7 @@ def given_state(
         keyframe=make_keyframe(fix, points),
         surface=grown_surface(begin.surface, fix, points, config),
         turn=begin.turn - _GIVEN,
+        vote=begin.vote - _GIVEN,
         lost=jnp.asarray(False),
     )
 
@@ -209,7 +213,8 @@ def _track_step(
         root, joints, information = register(*against, start, expected, config.registration)
         root = hold_still(state.root, root, information, config.registration.hold)
     tracked = Fix(root, joints, parts.at(joints), found.labels, constants, found.sure, found.turn)
-    turn = _turn_evidence(state, found.turn, config)
+    # Frames show the same object from nearly the same side, so that each counts for little.
+    turn = added(state.turn, jnp.clip(found.turn, -1.0, 1.0), config)
     due_turn = (turn.max() > config.turned) & ~state.lost
     turned = jnp.where(due_turn, turn.argmax(), 0).astype(jnp.int32)
 
@@ -229,8 +234,8 @@ def _track_step(
         category.num_parts,
         diagonal(constants),
     )
-    due = is_due(energy, unmatched, key.age, config)
-    fix, variance, asked, sure, replaced = corrected(
+    due = is_due(energy, unmatched, key.age, config) | (state.trial > 0)
+    correction = corrected(
         variables,
         points,
         frame.labels,
@@ -244,10 +249,11 @@ def _track_step(
         network,
         config,
     )
+    fix, sure, replaced = correction.fix, correction.sure, correction.replaced
     due |= replaced
-    settled = (
-        doubtful >= config.patience
-    ) & sure  # one that is unsure is asked again in the next frame
+    # One that is unsure is asked again in the next frame.
+    settled = (doubtful >= config.patience) & sure
+    left = jnp.maximum(state.trial - sure, 0)
     # Without keyframes a frame knows of the last one only.
     anew = replaced | (config.policy == "none")
     surface = jax.lax.cond(
@@ -269,7 +275,7 @@ def _track_step(
         root_velocity=jnp.where(replaced, 0.0, velocity),
         joint_velocity=jnp.where(replaced, 0.0, joint_velocity),
         constants=fix.constants,
-        variance=variance,
+        variance=correction.variance,
         keyframe=select(due, make_keyframe(fix, points), replace(key, age=key.age + 1)),
         surface=surface,
         accepted=jnp.where(
@@ -278,6 +284,8 @@ def _track_step(
         # A pose from the static estimator alone is on trial: one contradiction undoes it.
         doubtful=jnp.where(replaced, config.patience - 1, jnp.where(settled, 0, doubtful)),
         turn=jnp.where(replaced, 0.0, turn),
+        vote=jnp.where(replaced, 0.0, correction.vote),
+        trial=jnp.where(replaced, config.trial, left).astype(jnp.int32),
         lost=jnp.asarray(False),
     )
     held = replace(
@@ -291,19 +299,9 @@ def _track_step(
         labels=fix.labels,
         energy=energy,
         keyframe=due & frame.present,
-        estimated=asked & frame.present,
+        estimated=correction.asked & frame.present,
         lost=~frame.present | (contradicted & ~replaced),
     )
-
-
-def _turn_evidence(state: TrackerState, found, config: TrackerConfig):
-    """Log odds [24] of turns after this frame.
-
-    Frames show the same object from nearly the same side, so that each counts for little; and what
-    a closed object hides must not weigh more than what the open one then shows.
-    """
-    least = jnp.minimum(state.turn, -config.turned)
-    return jnp.maximum(state.turn + jnp.clip(found, -1.0, 1.0), least)
 
 
 def _expectations(config: RegistrationConfig, predicted, found):
