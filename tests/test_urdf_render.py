@@ -87,12 +87,15 @@ def test_visible_pixels_and_hidden_share(rendered):
     assert batch.visibility.min() < 0.999
 
 
-def test_same_seed_same_frames_and_noise_moves_them(rendered):
+def test_same_seed_and_split_same_frames_and_noise_moves_them(rendered):
     models, clean = rendered
     items = [generated(model, LAPTOP) for model in models]
-    again = render_frames(items, FRAMES, noise="none", num_points=POINTS, grid=GRID, seed=3)
+    options = {"num_points": POINTS, "grid": GRID, "seed": 3}
+    again = render_frames(items, FRAMES, noise="none", **options)
     np.testing.assert_array_equal(again.points, clean.points)
-    noisy = render_frames(items, FRAMES, noise="kinect", num_points=POINTS, grid=GRID, seed=3)
+    train = render_frames(items, FRAMES, noise="none", split="train", **options)
+    assert not np.isclose(train.pose.joint_state, clean.pose.joint_state).any()
+    noisy = render_frames(items, FRAMES, noise="kinect", **options)
     np.testing.assert_array_equal(noisy.pose.rotation, clean.pose.rotation)
     distance = np.linalg.norm(noisy.points[0, :, None] - clean.points[0], axis=-1).min(1)
     assert 2e-4 < np.median(distance) < 2e-2

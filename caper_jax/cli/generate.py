@@ -137,7 +137,7 @@ def _write_images(arguments: argparse.Namespace) -> None:
     import numpy as np
 
     from caper_jax import categories
-    from caper_jax.data.synthetic.bank import build_bank, draw_models
+    from caper_jax.data.synthetic.bank import build_bank, draw_models, split_key
     from caper_jax.data.synthetic.render import render_image, write_frame
     from caper_jax.progress import progress
 
@@ -145,7 +145,7 @@ def _write_images(arguments: argparse.Namespace) -> None:
     common.check_folder(arguments.out, "--out")
     models = draw_models(category, arguments.frames, arguments.split, arguments.seed)
     bank = build_bank(models)
-    key = jax.random.key(arguments.seed)
+    key = split_key(arguments.split, arguments.seed)
     with progress("rendering", total=arguments.frames) as bar:
         for index in range(arguments.frames):
             name = f"{category.name}_{index}"

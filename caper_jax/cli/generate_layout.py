@@ -39,7 +39,7 @@ def write_layout(arguments: argparse.Namespace) -> None:
 
     from caper_jax import categories
     from caper_jax.data.artimage_writer import LayoutWriter
-    from caper_jax.data.synthetic.bank import build_bank, draw_models
+    from caper_jax.data.synthetic.bank import build_bank, draw_models, split_key
     from caper_jax.data.synthetic.videos import FRAMES as FRAMES_PER_VIDEO
     from caper_jax.data.synthetic.views import clip, still
     from caper_jax.progress import progress
@@ -63,7 +63,7 @@ def write_layout(arguments: argparse.Namespace) -> None:
     first = _FIRST_OBJECT[arguments.split]
     for index, model in enumerate(models):
         writer.add_object(first + index, model)
-    key = jax.random.key(arguments.seed)
+    key = split_key(arguments.split, arguments.seed)
     with progress("rendering", total=count) as bar:
         for index in range(count):
             which = index % instances

@@ -149,6 +149,7 @@ def write_urdf_frames(arguments: argparse.Namespace) -> None:
             noise=arguments.noise,
             num_points=arguments.points,
             grid=arguments.grid,
+            split=arguments.split,
             seed=arguments.seed,
             report=bar.update,
         )

@@ -7,6 +7,7 @@ from collections import Counter
 from typing import Any
 
 import flax.struct
+import jax
 import numpy as np
 
 from caper_jax.articulation.category import Category, ObjectModel
@@ -97,6 +98,16 @@ def draw_models(category: Category, count: int, split: str, seed: int) -> list[O
     return [
         centered(category.shape(np.random.default_rng([*root, index]))) for index in range(count)
     ]
+
+
+def split_key(split: str, seed: int):
+    """PRNG key of the frames of a split: cameras, states, sensors and which instances they show.
+
+    "test" has the plain key of the seed, for the published figures rest on its frames; the others
+    fold their name in, or their frames would show the same views of other instances.
+    """
+    key = jax.random.key(seed)
+    return key if split == "test" else jax.random.fold_in(key, zlib.crc32(split.encode()))
 
 
 def build_bank(models: list[ObjectModel]) -> Bank:

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from caper_jax.data.synthetic.bank import split_key
 from caper_jax.data.synthetic.scene import Batch, Generator
 from caper_jax.data.synthetic.videos import VideoGenerator
 from caper_jax.progress import progress
@@ -16,18 +17,17 @@ FRAMES_AT_A_TIME = 25  # what the frames of a seed are depends on it
 
 
 def collect(
-    draw: Callable[[Any, int], Batch], seed: int, total: int, size: int, title: str = "generating"
+    draw: Callable[[Any, int], Batch], key: Any, total: int, size: int, title: str = "generating"
 ) -> Batch:
     """``total`` frames or videos as numpy arrays.
 
     Args:
       draw: (key, count) -> Batch, e.g. ``Generator.batch``.
-      seed: of all keys.
+      key: PRNG key, into which the number of each draw's first frame is folded.
       total: how many.
-      size: drawn at a time; the same seed and size give the same frames.
+      size: drawn at a time; the same key and size give the same frames.
       title: of the progress display.
     """
-    key = jax.random.key(seed)
     parts = []
     with progress(title, total=total) as bar:
         for start in range(0, total, size):
@@ -44,11 +44,13 @@ def collect_frames(
     """Single frames as the arguments of ``hdf5.write`` that they decide.
 
     Args:
-      generator: draws them.
-      seed, title: see ``collect``.
+      generator: draws them, of its split.
+      seed: of the split's key, see ``split_key``.
+      title: see ``collect``.
       frames: how many.
     """
-    batch = collect(generator.batch, seed, frames, FRAMES_AT_A_TIME, title)
+    key = split_key(generator.split, seed)
+    batch = collect(generator.batch, key, frames, FRAMES_AT_A_TIME, title)
     prefix = f"{generator.category.name}_{generator.split}"
     names = [f"{prefix}{instance:04d}_{index:06d}" for index, instance in enumerate(batch.instance)]
     return {**vars(batch), "names": names}
@@ -60,11 +62,12 @@ def collect_videos(
     """Videos one after the other, as the arguments of ``hdf5.write`` that they decide.
 
     Args:
-      generator: draws them.
-      seed, size, title: see ``collect``.
+      generator: draws them, of its split.
+      seed: of the split's key, see ``split_key``.
+      size, title: see ``collect``.
       videos: V.
     """
-    batch = collect(generator.batch, seed, videos, size, title)
+    batch = collect(generator.batch, split_key(generator.split, seed), videos, size, title)
     batch = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), batch)
     video, frame = np.divmod(np.arange(len(batch.points)), generator.frames)
     names = [f"{v:05d}/{f:06d}" for v, f in zip(video, frame, strict=True)]

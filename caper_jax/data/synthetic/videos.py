@@ -183,6 +183,7 @@ class VideoGenerator:
         self.config = config or GeneratorConfig()
         self.mode = mode
         self.frames = frames
+        self.split = split
         models = draw_models(category, self.config.instances, split, seed)
         self.bank = jax.tree.map(jnp.asarray, build_bank(models))
 

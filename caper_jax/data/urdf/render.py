@@ -17,7 +17,7 @@ import numpy as np
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.synthetic import sensor as sensors
-from caper_jax.data.synthetic.bank import Bank
+from caper_jax.data.synthetic.bank import Bank, split_key
 from caper_jax.data.synthetic.scene import Batch, Keys, draw_state_and_poses
 from caper_jax.data.urdf.canonical import ImportedObject
 from caper_jax.data.urdf.meshes import NEEDS_MESH, Mesh
@@ -110,6 +110,7 @@ def render_frames(
     noise: str = "kinect",
     num_points: int = 4096,
     grid: int = 128,
+    split: str = "test",
     seed: int = 0,
     report: Callable[[int], None] = lambda count: None,
 ) -> Batch:
@@ -121,7 +122,7 @@ def render_frames(
       noise: sensor preset.
       num_points: N points per frame.
       grid: rays per side over the object's projected box.
-      seed: the same arguments give the same frames.
+      split, seed: the same arguments give the same frames, see ``split_key``.
       report: called with the number of frames done since its last call.
 
     Returns:
@@ -135,7 +136,8 @@ def render_frames(
     casters = [PartCaster(item.reference.parts) for item in objects]
     instance = np.arange(frames) % len(objects)
     bank = _bank(objects)
-    frame_keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(np.arange(frames))
+    key = split_key(split, seed)
+    frame_keys = jax.vmap(partial(jax.random.fold_in, key))(np.arange(frames))
     instances = jax.tree.map(lambda values: values[instance], bank)
     keys, *drawn = _draw(frame_keys, instances, category, num_points)
     states, poses, grid_offsets, picks = map(np.asarray, drawn)
