@@ -163,6 +163,10 @@ def test_rendered_videos_as_of_pm_videos(tmp_path, small):
             ["--layout", "pm-videos", "--videos", "2", "--mode", "cam"],
             "--layout and --mode exclude",
         ),
+        (
+            ["--layout", "pm-videos", "--videos", "2", "--frames-per-video", "1"],
+            "a video needs at least 2 frames, got 1",
+        ),
     ],
 )
 def test_options_that_contradict_each_other(tmp_path, arguments, message):

@@ -14,6 +14,7 @@ from caper_jax.data.schema import pose_problems, validate
 from caper_jax.data.synthetic.camera import camera_arc, camera_pose, draw_camera
 from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.data.synthetic.videos import MODES, VideoGenerator, video
+from caper_jax.data.synthetic.views import clip
 from caper_jax.errors import CaperError
 
 LAPTOP = categories.get("laptop")
@@ -167,6 +168,8 @@ def test_wrong_arguments_are_named():
         VideoGenerator(LAPTOP, CONFIG, "papr")
     with pytest.raises(CaperError, match="at least 2 frames, got 1"):
         video(jax.random.key(0), None, LAPTOP, CONFIG, "cam", 1)
+    with pytest.raises(CaperError, match="at least 2 frames, got 1"):
+        clip(jax.random.key(0), None, LAPTOP, "none", np.eye(3), 64, 1, 0)
 
 
 def test_generate_writes_videos_that_read_back(tmp_path, capsys):

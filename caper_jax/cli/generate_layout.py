@@ -41,6 +41,7 @@ def write_layout(arguments: argparse.Namespace) -> None:
     from caper_jax.data.artimage_writer import LayoutWriter
     from caper_jax.data.synthetic.bank import build_bank, draw_models, split_key
     from caper_jax.data.synthetic.videos import FRAMES as FRAMES_PER_VIDEO
+    from caper_jax.data.synthetic.videos import check_length
     from caper_jax.data.synthetic.views import clip, still
     from caper_jax.progress import progress
 
@@ -52,6 +53,8 @@ def write_layout(arguments: argparse.Namespace) -> None:
     for option in ("images", "mode"):
         if getattr(arguments, option):
             raise CaperError(f"--layout and --{option} exclude each other")
+    length = arguments.frames_per_video or FRAMES_PER_VIDEO
+    check_length(length)
     category = categories.get(arguments.category)
     common.check_folder(arguments.out, "--out")
     count = arguments.videos if videos else arguments.frames
@@ -72,7 +75,6 @@ def write_layout(arguments: argparse.Namespace) -> None:
             shown = (frame_key, instance, category, arguments.noise, intrinsics, SIZE)
             if videos:
                 moving = index % category.num_joints
-                length = arguments.frames_per_video or FRAMES_PER_VIDEO
                 writer.add_video(first + which, clip(*shown, length, moving), moving + 1)
             else:
                 writer.add_frame(first + which, still(*shown))

@@ -79,12 +79,21 @@ def video(
     return _video(key, instance, _motion(mode, frames), category, config, frames)
 
 
+def check_length(frames: int) -> None:
+    """Refuses a video in which nothing could move.
+
+    Raises:
+      CaperError: less than two frames.
+    """
+    if frames < 2:
+        raise CaperError(f"a video needs at least 2 frames, got {frames}")
+
+
 def _motion(mode: str, frames: int) -> Mode:
     """A mode as arrays."""
     if mode not in MODES:
         raise unknown_name("video mode", mode, MODES)
-    if frames < 2:
-        raise CaperError(f"a video needs at least 2 frames, got {frames}")
+    check_length(frames)
     speed, reverses, still = MODES[mode]
     return Mode(jnp.float32(speed), jnp.asarray(reverses), jnp.asarray(still))
 

@@ -13,6 +13,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.data.synthetic.bank import Bank
 from caper_jax.data.synthetic.render import Image, render_pose
 from caper_jax.data.synthetic.scene import draw_state_and_poses, part_poses
+from caper_jax.data.synthetic.videos import check_length
 
 # Share of the image that the object may fill, from its middle to each side.
 _FILL = 0.92
@@ -57,7 +58,11 @@ def clip(
       key, instance, category, noise, intrinsics, size: as for ``still``.
       frames: T.
       moving: index of the joint.
+
+    Raises:
+      CaperError: less than two frames.
     """
+    check_length(frames)
     keys = jax.random.split(key, 3)
     state, poses, _ = _draw(keys[0], instance, category)
     rng = np.random.default_rng(np.asarray(jax.random.bits(keys[1], (4,))))
