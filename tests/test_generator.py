@@ -129,6 +129,14 @@ def test_picks_follow_one_another_evenly_along_the_scan():
         assert (off > -1).all() and (off <= step).all()
 
 
+def test_the_last_pick_is_a_hit_however_it_is_rounded(monkeypatch):
+    hit = np.zeros((96, 96), bool)
+    hit[20:70, 20:70] = True
+    largest = jnp.float32(1 - 2**-23)  # that jax.random.uniform gives
+    monkeypatch.setattr(jax.random, "uniform", lambda key, shape: jnp.full(shape, largest))
+    assert hit.ravel()[systematic(jax.random.key(0), jnp.asarray(hit), 1024)].all()
+
+
 def test_part_poses_follow_the_joints(clean):
     """SciPy composes the motions along the tree."""
     category, _, batch = clean

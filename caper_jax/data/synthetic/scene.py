@@ -57,6 +57,8 @@ def systematic(key, hit, count: int):
     total = running[-1]
     offset = jax.random.uniform(key, (count,))
     rank = jnp.floor((jnp.arange(count) + offset) * total / count).astype(jnp.int32) + 1
+    # In float32, r + u may be rounded up to count: that would be one hit too many.
+    rank = jnp.minimum(rank, total)
     place = jnp.clip(jnp.searchsorted(running, rank, side="left"), 0, order.shape[0] - 1)
     return order[place]
 
