@@ -284,6 +284,13 @@ class TestSensor:
         assert (points[..., 2] - depth).std() == pytest.approx(expected, rel=0.05)
         assert abs((points[..., 2] - depth).mean()) < 0.15 * expected
 
+    @pytest.mark.parametrize("distance", [0.4, 1.0, 2.5])
+    def test_stereo_noise_is_that_of_its_baseline(self, distance):
+        _, points, _, depth, _ = self.wall("realsense", distance=distance)
+        pixel = distance**2 / (640 * 0.05)  # a pixel of disparity, metres
+        expected = np.hypot(0.08 * pixel, pixel / 32 / np.sqrt(12))
+        assert (points[..., 2] - depth).std() == pytest.approx(expected, rel=0.05)
+
     def test_incidence_is_the_angle_to_the_normal(self):
         # The wall's normal is (tan tilt, 0, 1) up to scale.
         tilt = 0.7

@@ -23,8 +23,9 @@ class Sensor:
     """Coefficients of the noise model, metres; arrays or floats.
 
     Attributes:
-      floor: axial standard deviation at 0.4 m.
-      quadratic: added axial standard deviation per (z - 0.4 m)^2.
+      floor: axial standard deviation at ``origin``.
+      origin: distance from which on the axial noise grows.
+      quadratic: added axial standard deviation per (z - origin)^2.
       incidence: weight of the grazing-angle term.
       focal_baseline: focal length [px] times baseline [m] of the disparity; 0 turns rounding off.
       disparity_step: disparity resolution, px.
@@ -35,6 +36,7 @@ class Sensor:
     """
 
     floor: Any
+    origin: Any
     quadratic: Any
     incidence: Any
     focal_baseline: Any
@@ -46,11 +48,11 @@ class Sensor:
 
 
 PRESETS: dict[str, Sensor] = {
-    "none": Sensor(0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0),
-    "gauss3mm": Sensor(0.0, 0.0, 0.0, 0.0, 1.0, 0.003, 0.0, 0.0, 0.0),
-    "kinect": Sensor(0.0012, 0.0019, 1.0, 570.0 * 0.075, 0.125, 0.0, 0.35, 0.6, 0.05),
+    "none": Sensor(0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0),
+    "gauss3mm": Sensor(0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.003, 0.0, 0.0, 0.0),
+    "kinect": Sensor(0.0012, 0.4, 0.0019, 1.0, 570.0 * 0.075, 0.125, 0.0, 0.35, 0.6, 0.05),
     # D435: baseline 50 mm; noise z^2 * 0.08 px / (f B) with f = 640 px at 848 px width.
-    "realsense": Sensor(0.0004, 0.0025, 0.5, 640.0 * 0.05, 1 / 32, 0.0, 0.3, 0.5, 0.15),
+    "realsense": Sensor(0.0, 0.0, 0.0025, 0.5, 640.0 * 0.05, 1 / 32, 0.0, 0.3, 0.5, 0.15),
 }
 CAMERAS = ("kinect", "realsense")  # the presets that stand for what is sold
 
@@ -145,7 +147,8 @@ def measure(key, sensor: Sensor, surface: Surface, rays):
     depth = surface.depth
     angle = jnp.arccos(surface.cosine)
     grazing = (angle / (jnp.pi / 2 - angle)) ** 2 * 1e-4 / jnp.sqrt(jnp.maximum(depth, 0.1))
-    sigma = sensor.floor + sensor.quadratic * (depth - 0.4) ** 2 + sensor.incidence * grazing
+    axial = sensor.floor + sensor.quadratic * (depth - sensor.origin) ** 2
+    sigma = axial + sensor.incidence * grazing
     normal = jax.random.normal(normal_key, (4, *depth.shape))
     z = depth + sigma * normal[0]
     # Mixed pixels lie part of the way to the surface behind.
