@@ -17,6 +17,7 @@ from urdf_models import (
     DRAWER_SIZE,
     LAPTOP_BASE,
     LAPTOP_LID,
+    Robot,
     partnet_drawer,
     partnet_laptop,
     serial_arm,
@@ -210,6 +211,25 @@ def test_frames_and_rest_poses_are_found(name, monkeypatch):
                     assert off <= loose + 1e-6, (index, off)
                 if not state.any():
                     np.testing.assert_allclose(item.reference.pivot, _centered(model), atol=1e-6)
+
+
+def test_up_is_where_drawers_follow_one_another():
+    """Cabinets with y up and the front to x, against the convention of z up."""
+    turn = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], float)
+    for model in draw_models(DRAWER, 6, "test", 11):
+        item = bring(as_urdf(model, DRAWER, turn, np.zeros(3)), DRAWER, ImportOptions())
+        np.testing.assert_allclose(item.reference.axis, model.axis, atol=1e-6)
+        np.testing.assert_allclose(item.reference.pivot, _centered(model), atol=0.002)
+        assert any("y = +y" in note and "up detected" in note for note in item.notes)
+
+
+def test_up_is_assumed_where_drawers_stand_side_by_side(tmp_path):
+    robot = Robot(tmp_path).link("body", ((0, 0, 0), (0.5, 1.9, 0.35)))
+    for index, y in enumerate((-0.62, 0.0, 0.62)):
+        robot.link(f"drawer{index}", ((0.06, y, 0), (0.4, 0.6, 0.3)))
+        robot.joint(f"joint{index}", "prismatic", "body", f"drawer{index}", limits=(0.0, 0.3))
+    item = import_urdf(robot.write(), DRAWER)
+    assert any("y = +z" in note and "(up assumed and front" in note for note in item.notes)
 
 
 def _centered(model):

@@ -116,7 +116,7 @@ def _other_root(reference: Reference, category: Category) -> bool:
 
 def _scissors_reading(at_rest: Reference) -> Reading:
     """x between the tips, y so that the scissors open about it."""
-    up, front = rule_of("scissors").frame(at_rest)
+    up, front, _ = rule_of("scissors").frame(at_rest)
     front = front - (front @ up) * up
     y, z = up / np.linalg.norm(up), front / np.linalg.norm(front)
     turn = np.stack([np.cross(y, z), y, z])

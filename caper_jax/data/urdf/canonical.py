@@ -161,7 +161,7 @@ def _axes(
     model: UrdfModel, rule: Rule, at_rest: Reference, options: ImportOptions
 ) -> tuple[np.ndarray, str]:
     """Rotation [3, 3] from the file's frame to the canonical one, and a note on it."""
-    up, front = (np.asarray(d, np.float64) for d in rule.frame(at_rest))
+    up, front, assumed = rule.frame(at_rest)
     given = [d for d in (options.up, options.front) if d is not None]
     up = up if options.up is None else np.asarray(options.up, np.float64)
     front = front if options.front is None else np.asarray(options.front, np.float64)
@@ -180,7 +180,7 @@ def _axes(
     snapped = along and straight and angle <= rule.snap
     rotation = nearest if snapped else rotation
     source = " and ".join(
-        f"{name} {'given' if option is not None else 'detected'}"
+        f"{name} {'given' if option is not None else 'assumed' if name in assumed else 'detected'}"
         for name, option in (("up", options.up), ("front", options.front))
     )
     note = ", ".join(f"{name} = {_named(row)}" for name, row in zip("xyz", rotation, strict=True))

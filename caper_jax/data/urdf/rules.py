@@ -11,13 +11,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from caper_jax.data.urdf.reference import Reference
 
-Frame = tuple[np.ndarray, np.ndarray]
 _X, _Y, _Z = np.eye(3)
+
+
+class Frame(NamedTuple):
+    """Canonical axes in the file's frame.
+
+    Attributes:
+      up, front: [3] canonical y and z; of any length, not quite at right angles.
+      assumed: which of "up" and "front" only a convention says.
+    """
+
+    up: np.ndarray
+    front: np.ndarray
+    assumed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -26,7 +39,7 @@ class Rule:
 
     Attributes:
       rest: [J] states, from the file's 0, of the object in the file's frame.
-      frame: (up, front): canonical y and z in the file's frame, for the object at rest.
+      frame: up and front in the file's frame, for the object at rest.
       opening: [J, 3] direction, canonical, about or along which each joint opens; None keeps the
         sense of the file.
       order: axis (0, 1, 2) along which parts on the root are numbered; None keeps the file's order.
@@ -184,29 +197,49 @@ def _usual_up(ref: Reference, across: np.ndarray) -> np.ndarray:
 
 
 def _usual_frame(ref: Reference) -> Frame:
-    return _Z, _X
+    return Frame(_Z, _X, ("up", "front"))
 
 
 def _laptop_frame(ref: Reference) -> Frame:
-    return ref.direction(1, 0), _level(ref.direction(0, 0))
+    return Frame(ref.direction(1, 0), _level(ref.direction(0, 0)))
 
 
 def _lid_frame(ref: Reference) -> Frame:
     """box and stapler, closed: front from the hinge along the lid, up where the lid swings."""
     front = ref.direction(1, 0)
-    return _opens(ref, 0) * np.cross(ref.axis[0], front), front
+    return Frame(_opens(ref, 0) * np.cross(ref.axis[0], front), front)
 
 
 def _door_frame(ref: Reference) -> Frame:
     """dishwasher, open: front from the hinge along the door, up where the door closes."""
     front = ref.direction(1, 0)
-    return _opens(ref, 0) * np.cross(ref.axis[0], front), front
+    return Frame(_opens(ref, 0) * np.cross(ref.axis[0], front), front)
 
 
 def _slide_frame(ref: Reference) -> Frame:
-    """drawer: front where the drawers go."""
+    """drawer: front where the drawers go, up along their stack."""
     front = ref.axis[0] * _opens(ref, 0)
-    return _usual_up(ref, front), front
+    up = _stack(ref, front)
+    if up is None:
+        return Frame(_usual_up(ref, front), front, ("up",))
+    return Frame(up, front)
+
+
+def _stack(ref: Reference, front: np.ndarray) -> np.ndarray | None:
+    """drawer: the direction across the front in which the drawers follow one another.
+
+    None where they spread nearly as far the other way, or would be much taller than wide: such
+    drawers stand side by side.
+    """
+    across = np.eye(3) - np.outer(front, front)
+    centers = np.array([mesh.bounds().mean(0) for mesh in ref.parts[1:]]) @ across
+    variance, directions = np.linalg.eigh(np.cov(centers.T))
+    up = _axis_near(_level(directions[:, -1]))
+    height, width = (
+        np.mean([np.ptp(mesh.vertices @ direction) for mesh in ref.parts[1:]])
+        for direction in (up, np.cross(up, front))
+    )
+    return up if variance[-1] > 4 * variance[-2] and height < 1.25 * width else None
 
 
 def _cutter_frame(ref: Reference) -> Frame:
@@ -231,19 +264,19 @@ def _cutter_frame(ref: Reference) -> Frame:
         # The travel itself has the value 0; the thin direction comes next.
         up = np.linalg.eigh(second)[1][:, 1]
     up = up * np.sign(shift(up)) if abs(shift(up)) > 0.05 else _axis_near(up)
-    return up, np.cross(travel, up)
+    return Frame(up, np.cross(travel, up))
 
 
 def _glasses_frame(ref: Reference) -> Frame:
     back = np.sum([ref.direction(joint + 1, joint) for joint in range(ref.num_joints)], axis=0)
-    return _axis_near(ref.axis[0]), -back
+    return Frame(_axis_near(ref.axis[0]), -back)
 
 
 def _scissors_frame(ref: Reference) -> Frame:
     """x to the tips, y along the pivot so that the root's tip is at +z."""
     root, other, sense = _tips(ref)
     up = sense * ref.axis[0]
-    return up, np.cross(root + other, up)
+    return Frame(up, np.cross(root + other, up))
 
 
 def _longer_handle(ref: Reference) -> int:
@@ -265,8 +298,8 @@ def _arm_frame(ref: Reference) -> Frame:
     level = reach - (reach @ up) * up
     if np.linalg.norm(level) < 0.03 * np.linalg.norm(np.ptp(ref.bounds(), axis=0)):
         # Straight up: x where z is up (robotics), z where y is up (graphics).
-        level = np.roll(_axis_near(up), 1)
-    return up, level
+        return Frame(up, np.roll(_axis_near(up), 1), ("front",))
+    return Frame(up, level)
 
 
 def _temple_axes(ref: Reference) -> np.ndarray:
