@@ -140,6 +140,21 @@ def test_partnet_drawer_by_hand(tmp_path):
     assert "locked: joint_5 (prismatic) at 0" in item.notes
 
 
+def test_links_that_mimic_a_joint_are_at_its_rest(tmp_path):
+    """A flap in the lid of a laptop modelled shut: upright when shut, flat at rest, 90 deg open."""
+    robot = Robot(tmp_path).link("base", ((0.12, 0, -0.01), (0.24, 0.34, 0.02)))
+    robot.link("lid", ((0.12, 0, 0.005), (0.24, 0.34, 0.01)))
+    robot.link("flap", ((0, 0, 0), (0.02, 0.02, 0.06)))
+    robot.joint("hinge", "revolute", "base", "lid", axis=(0, 1, 0), limits=(-2.4, 0.0))
+    robot.joint(
+        "flap_hinge", "revolute", "lid", "flap", xyz=(0.1, 0, 0.005), axis=(0, 1, 0),
+        limits=(-2.0, 2.0), extra='<mimic joint="hinge" multiplier="-1"/>',
+    )  # fmt: skip
+    item = import_urdf(robot.write(), LAPTOP)
+    np.testing.assert_allclose(item.size[1], [0.34, 0.24, 0.02], atol=1e-9)
+    assert "locked: flap_hinge (mimics hinge)" in item.notes
+
+
 def test_arm_merges_wrist_and_fingers(tmp_path):
     model = read_urdf(serial_arm(tmp_path))
     tree = map_parts(model, ROBOTARM)

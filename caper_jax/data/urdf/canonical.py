@@ -100,13 +100,15 @@ def bring(model: UrdfModel, category: Category, options: ImportOptions) -> Impor
     rule = rule_of(category.name)
     raw = reference(model, tree)
     if rule.root is not None and options.parts is None and rule.root(raw) == 1:
-        raw = raw.exchanged()
-        tree = replace(tree, links=tree.links[::-1])
+        tree = tree.exchanged()
+        raw = reference(model, tree)
     names = [part.joint.name for part in tree.joints]
     found = np.array([given.get(name, np.nan) for name in names], np.float64)
     if np.isnan(found).any():
         found = np.where(np.isnan(found), rule.rest(raw), found)
-    at_rest = raw.at(found)
+    # What mimics a joint is where that joint's rest state puts it, not its state 0.
+    resting = tree.locked | dict(zip(names, found.tolist(), strict=True))
+    at_rest = reference(model.following(resting), tree).at(found)
     rotation, about_frame = _axes(model, rule, at_rest, options)
     scale, about_scale = _scale(at_rest, category, options.scale)
     pose = np.eye(4)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
@@ -93,12 +93,27 @@ class UrdfModel:
             for joint in outgoing.get(link, ()):
                 state = states.get(joint.name, 0.0)
                 if joint.mimic is not None:
-                    followed, multiplier, offset = joint.mimic
-                    state = multiplier * states.get(followed, 0.0) + offset
+                    state = _followed(joint.mimic, states)
                 motion = joint_motion(joint.kind, joint.axis, np.zeros(3), state)
                 poses[joint.child] = poses[link] @ joint.origin @ motion
                 open_links.append(joint.child)
         return poses
+
+    def following(self, states: Mapping[str, float]) -> UrdfModel:
+        """With every mimicking joint held where it stands at these states of the others."""
+        joints = tuple(
+            joint
+            if joint.mimic is None
+            else replace(joint, mimic=(joint.mimic[0], 0.0, _followed(joint.mimic, states)))
+            for joint in self.joints
+        )
+        return replace(self, joints=joints)
+
+
+def _followed(mimic: tuple[str, float, float], states: Mapping[str, float]) -> float:
+    """State of a mimicking joint at those of the others; joints left out stand at 0."""
+    name, multiplier, offset = mimic
+    return multiplier * states.get(name, 0.0) + offset
 
 
 def joint_motion(kind: str, axis: np.ndarray, pivot: np.ndarray, state: float) -> np.ndarray:

@@ -9,7 +9,7 @@ an error that names the candidates, to be settled by naming the parts' links.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from caper_jax.articulation.category import Category
 from caper_jax.data.urdf.link_tree import LinkTree
@@ -57,6 +57,11 @@ class PartTree:
     joints: tuple[PartJoint, ...]
     locked: dict[str, float]
     notes: tuple[str, ...]
+
+    def exchanged(self) -> PartTree:
+        """Two parts, the other one the root."""
+        joints = tuple(replace(joint, reversed=not joint.reversed) for joint in self.joints)
+        return replace(self, links=self.links[::-1], joints=joints)
 
 
 def map_parts(

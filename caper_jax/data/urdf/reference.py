@@ -141,7 +141,10 @@ class Reference:
 
 
 def reference(model: UrdfModel, tree: PartTree) -> Reference:
-    """The object as the file holds it at state 0, in the frame of the file's root link."""
+    """The object as the file holds it at state 0, in the frame of the file's root link.
+
+    Joints that mimic others stand where ``tree.locked``, and state 0 of the rest, put them.
+    """
     poses = model.link_poses(tree.locked)
     parts = []
     for links in tree.links:
