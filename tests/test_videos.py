@@ -18,6 +18,8 @@ from caper_jax.data.synthetic.views import clip
 from caper_jax.errors import CaperError
 
 LAPTOP = categories.get("laptop")
+URDF = "no_such.urdf"
+ARTIMAGE, IMAGES = ["--layout", "artimage", "--frames", "1"], ["--images", "--frames", "1"]
 CONFIG = GeneratorConfig(instances=10, grid=40, num_points=256, noise=("none",))
 VIDEOS, FRAMES = 6, 30
 
@@ -202,9 +204,21 @@ def test_generate_writes_videos_that_read_back(tmp_path, capsys):
         (["--videos", "2", "--images"], "--videos and --images exclude each other"),
         (["--mode", "cam"], "--mode is of videos: add --videos N"),
         (["--frames-per-video", "3"], "--frames-per-video is of videos"),
+        (["--points", "5"], "--points must be at least 16, got 5"),
+        (["--urdf", URDF, "--points", "1"], "--points must be at least 16, got 1"),
+        (["--urdf", URDF, "--grid", "1"], "--grid must be at least 8, got 1"),
+        (["--urdf", URDF, "--instances", "3"], "--instances has no effect with --urdf"),
+        (["--urdf", URDF, "--noise", "kinekt"], "unknown --noise 'kinekt'; did you mean 'kinect'"),
+        ([*ARTIMAGE, "--noise", "kinekt"], "unknown --noise 'kinekt'"),
+        ([*ARTIMAGE, "--grid", "96"], "--grid has no effect with --layout"),
+        ([*IMAGES, "--grid", "96"], "--grid has no effect with --images: leave it out"),
+        ([*IMAGES, "--points", "1024"], "--points has no effect with --images"),
+        ([*IMAGES, "--instances", "3"], "--instances has no effect with --images"),
     ],
 )
-def test_options_that_contradict_each_other(options, message, tmp_path, capsys):
+def test_options_that_make_no_sense(options, message, tmp_path, capsys):
+    """Refused before anything is written or, of a URDF, read."""
     out = ["--out", str(tmp_path / "x.h5")]
     assert cli.main(["generate", "--category", "laptop", *options, *out]) == 2
     assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -9,14 +9,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from caper_jax.cli import common, generate_layout, generate_urdf
-from caper_jax.errors import CaperError
+from caper_jax.errors import CaperError, unknown_name
 
 if TYPE_CHECKING:
     from caper_jax.articulation.category import Category
     from caper_jax.data.synthetic.config import GeneratorConfig
 
-FRAMES = 1000
+DEFAULTS = {"frames": 1000, "instances": 100, "points": 4096, "grid": 128}
 VIDEO_BATCH = 4
+# What has no effect on other outputs than the usual file.
+_UNUSED = {
+    "images": ("instances", "points", "grid"),
+    "layout": ("points", "grid"),
+    "urdf": ("instances",),
+}
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -44,7 +50,9 @@ def build_parser() -> argparse.ArgumentParser:
         help="whose instances (default: %(default)s)",
     )
     parser.add_argument(
-        "--frames", type=common.positive_int, help=f"single frames (default: {FRAMES})"
+        "--frames",
+        type=common.positive_int,
+        help=f"single frames (default: {DEFAULTS['frames']})",
     )
     parser.add_argument(
         "--videos",
@@ -72,17 +80,18 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--instances",
         type=common.positive_int,
-        default=100,
-        help="shapes that the frames show (default: %(default)s; with --images one per frame)",
+        help=f"shapes that the frames show (default: {DEFAULTS['instances']}; --images: one per "
+        "frame)",
     )
     parser.add_argument(
-        "--points", type=common.positive_int, default=4096, help="per frame (default: %(default)s)"
+        "--points",
+        type=common.positive_int,
+        help=f"per frame (default: {DEFAULTS['points']})",
     )
     parser.add_argument(
         "--grid",
         type=common.positive_int,
-        default=128,
-        help="rays per side of the object's box in the image (default: %(default)s)",
+        help=f"rays per side of the object's box in the image (default: {DEFAULTS['grid']})",
     )
     parser.add_argument(
         "--images",
@@ -107,7 +116,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
     _check_options(arguments)
     generate_urdf.check_options(arguments)
-    arguments.frames = arguments.frames or FRAMES
+    for option, value in DEFAULTS.items():
+        if getattr(arguments, option) is None:
+            setattr(arguments, option, value)
     if arguments.urdf:
         generate_urdf.write_urdf_frames(arguments)
     elif arguments.layout:
@@ -120,7 +131,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _check_options(arguments: argparse.Namespace) -> None:
-    """Refuses options that contradict each other."""
+    """Refuses, before anything is written, options that are wrong or contradict each other.
+
+    Raises:
+      CaperError: names them.
+    """
+    from caper_jax.data.synthetic.config import LEAST
+    from caper_jax.data.synthetic.sensor import PRESETS
+
     if arguments.videos:
         for option in ("frames", "images"):
             if getattr(arguments, option):
@@ -129,6 +147,16 @@ def _check_options(arguments: argparse.Namespace) -> None:
         for option in ("mode", "frames_per_video"):
             if getattr(arguments, option):
                 raise CaperError(f"--{option.replace('_', '-')} is of videos: add --videos N")
+    for kind, unused in _UNUSED.items():
+        for option in unused:
+            if getattr(arguments, kind) and getattr(arguments, option) is not None:
+                raise CaperError(f"--{option} has no effect with --{kind}: leave it out")
+    for option, name in (("points", "num_points"), ("grid", "grid")):
+        value = getattr(arguments, option)
+        if value is not None and value < LEAST[name]:
+            raise CaperError(f"--{option} must be at least {LEAST[name]}, got {value}")
+    if arguments.noise not in PRESETS:
+        raise unknown_name("--noise", arguments.noise, PRESETS)
 
 
 def _write_images(arguments: argparse.Namespace) -> None:

@@ -12,6 +12,8 @@ _FRACTIONS = (
     "occlusion", "erosion", "table", "clutter", "spill", "residue", "dropout", "holes",
 )  # fmt: skip
 
+LEAST = {"instances": 1, "grid": 8, "num_points": 16}
+
 
 @dataclass(frozen=True)
 class GeneratorConfig:
@@ -61,7 +63,7 @@ class GeneratorConfig:
     measure_visibility: bool = False
 
     def __post_init__(self) -> None:
-        for name, low in (("instances", 1), ("grid", 8), ("num_points", 16)):
+        for name, low in LEAST.items():
             if getattr(self, name) < low:
                 raise CaperError(f"data.{name} must be at least {low}, got {getattr(self, name)}")
         for name in _FRACTIONS:
