@@ -96,6 +96,20 @@ def test_mask_is_whatever_is_not_black(tmp_path, value):
     np.testing.assert_array_equal(read_mask(save(tmp_path / "mask.npy", expected)), expected)
 
 
+@pytest.mark.parametrize("suffix", ["png", "gif"])
+@pytest.mark.parametrize("white_first", [False, True])
+def test_black_in_a_palette_is_a_colour_not_a_number(tmp_path, suffix, white_first):
+    """PIL's quantize puts the commonest colour first, and that may be white."""
+    expected = np.zeros((4, 5), bool)
+    expected[1:3, 2:] = True
+    image = Image.new("P", (5, 4))
+    image.putdata((expected != white_first).ravel().tolist())
+    image.putpalette([255] * 3 + [0] * 3 if white_first else [0] * 3 + [255] * 3)
+    path = tmp_path / f"mask.{suffix}"
+    image.save(path)
+    np.testing.assert_array_equal(read_mask(path), expected)
+
+
 def test_jpeg_masks_do_not_count_their_noise(tmp_path):
     expected = np.zeros((64, 64), bool)
     expected[17:40, 9:51] = True

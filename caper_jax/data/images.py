@@ -80,7 +80,8 @@ def read_mask(path: str | Path, allow_empty: bool = False) -> np.ndarray:
 
     Args:
       path: grayscale, palette or colour image (transparent pixels are outside), or ``.npy``. In a
-        JPEG, whose black is not quite black, values above 127 count.
+        JPEG, whose black is not quite black, values above 127 count. Black is a colour: the number
+        that a palette gives it means nothing.
       allow_empty: take a mask without a pixel, of a frame that does not show the object.
 
     Returns:
@@ -89,7 +90,7 @@ def read_mask(path: str | Path, allow_empty: bool = False) -> np.ndarray:
     Raises:
       CaperError: missing or broken file, wrong shape, or no pixel in the mask.
     """
-    raw = read_array(path)
+    raw = read_array(path, colours=True)
     if raw.ndim not in (2, 3) or (raw.ndim == 3 and raw.shape[-1] not in (2, 3, 4)):
         raise CaperError(f"{path}: a mask must be an image, got an array of shape {raw.shape}")
     threshold = 127 if Path(path).suffix.lower() in (".jpg", ".jpeg") else 0
@@ -127,10 +128,10 @@ def read_labels(path: str | Path) -> np.ndarray:
     return raw.astype(np.int32)
 
 
-def read_array(path: str | Path) -> np.ndarray:
+def read_array(path: str | Path, colours: bool = False) -> np.ndarray:
     """Pixels of an image or ``.npy`` file as stored: [H, W] or [H, W, C].
 
-    Palette images give their indices, one-bit images booleans.
+    Palette images give their indices, or with ``colours`` RGBA; one-bit images give booleans.
 
     Raises:
       CaperError: the file is missing, broken, or would need unpickling.
@@ -142,7 +143,8 @@ def read_array(path: str | Path) -> np.ndarray:
         if path.suffix.lower() == ".npy":
             return np.load(path, allow_pickle=False)
         with Image.open(path) as image:
-            return np.asarray(image)
+            palette = image.mode in ("P", "PA")
+            return np.asarray(image.convert("RGBA") if colours and palette else image)
     except UnidentifiedImageError as error:
         raise CaperError(f"{path}: not an image (PNG, JPEG, TIFF or .npy expected)") from error
     except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
