@@ -42,6 +42,21 @@ def test_three_channel_depth_is_read_as_artimage_writes_it(tmp_path):
     np.testing.assert_allclose(read_depth(path), millimetres / 1000, rtol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["photo.jpg", "photo.png", "grey.png"])
+def test_pictures_are_no_depth(tmp_path, name):
+    colours = np.random.default_rng(0).integers(1, 200, (16, 16, 3)).astype(np.uint8)
+    if name.startswith("grey"):
+        colours[...] = colours[..., :1]
+    path = tmp_path / name
+    Image.fromarray(colours).save(path, "JPEG" if name.startswith("photo") else "PNG")
+    with pytest.raises(CaperError, match=rf"{name}: looks like a picture, not depth"):
+        read_depth(path)
+
+
+def test_an_all_black_image_has_no_measurements(tmp_path):
+    assert not read_depth(save(tmp_path / "d.png", np.zeros((4, 4, 3), np.uint8))).any()
+
+
 def test_depth_scale_overrides_the_unit(tmp_path):
     path = save(tmp_path / "d.png", np.full((2, 2), 12000, np.uint16))
     np.testing.assert_allclose(read_depth(path, scale=1e-4), 1.2, rtol=1e-6)

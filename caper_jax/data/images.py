@@ -31,11 +31,13 @@ def read_depth(path: str | Path, scale: float | None = None) -> np.ndarray:
       [H, W] float32 metres; 0, NaN and infinity mark pixels without a measurement.
 
     Raises:
-      CaperError: missing or broken file, a kind of image that holds no depth, or values that
-        cannot be metres after scaling (the message says which unit they seem to be in).
+      CaperError: missing or broken file, a kind of image that holds no depth (a picture, such as a
+        photo), or values that cannot be metres after scaling (the message says which unit they
+        seem to be in).
     """
     raw = read_array(path)
     if raw.ndim == 3 and raw.shape[-1] == 3 and raw.dtype == np.uint8:
+        _refuse_picture(path, raw)
         raw = 256 * raw[..., 1].astype(np.uint16) + raw[..., 0]
     elif raw.ndim != 2 or raw.dtype == np.uint8 or raw.dtype == bool:
         raise CaperError(
@@ -51,6 +53,27 @@ def read_depth(path: str | Path, scale: float | None = None) -> np.ndarray:
     if valid.any():
         _check_range(path, float(np.median(depth[valid])), integer, scale)
     return depth
+
+
+def _refuse_picture(path: str | Path, raw: np.ndarray) -> None:
+    """Refuses colours [H, W, 3] that cannot be millimetres in two channels."""
+    grey = np.array_equal(raw[..., 0], raw[..., 1]) and np.array_equal(raw[..., 1], raw[..., 2])
+    if _is_jpeg(path):
+        sign = "JPEG alters values"
+    elif grey and raw.any():  # all black is an image without a measurement
+        sign = "its three channels are equal"
+    else:
+        return
+    raise CaperError(
+        f"{path}: looks like a picture, not depth ({sign}); give a 16-bit grayscale PNG in "
+        "millimetres or a float .npy [H, W] in metres"
+    )
+
+
+def _is_jpeg(path: str | Path) -> bool:
+    """Whether a file is a JPEG, whatever its name says."""
+    with open(path, "rb") as file:
+        return file.read(3) == b"\xff\xd8\xff"
 
 
 def _check_range(path: str | Path, median: float, integer: bool, scale: float | None) -> None:
@@ -93,7 +116,7 @@ def read_mask(path: str | Path, allow_empty: bool = False) -> np.ndarray:
     raw = read_array(path, colours=True)
     if raw.ndim not in (2, 3) or (raw.ndim == 3 and raw.shape[-1] not in (2, 3, 4)):
         raise CaperError(f"{path}: a mask must be an image, got an array of shape {raw.shape}")
-    threshold = 127 if Path(path).suffix.lower() in (".jpg", ".jpeg") else 0
+    threshold = 127 if _is_jpeg(path) else 0
     if raw.ndim == 2:
         mask = np.asarray(raw > threshold)
     elif raw.shape[-1] == 3:
