@@ -8,7 +8,7 @@ from depth_videos import write_video
 from PIL import Image
 
 from caper_jax.data.cloud import cloud_from_depth
-from caper_jax.data.depth_folder import DepthFolder, is_depth_folder, natural_order
+from caper_jax.data.depth_folder import DepthFolder, is_depth_folder
 from caper_jax.errors import CaperError
 
 MATRIX = np.array([[90.0, 0, 31.5], [0, 95.0, 23.5], [0, 0, 1]])
@@ -88,10 +88,3 @@ def test_broken_and_foreign_images_are_named_when_read(tmp_path):
     for index, message in enumerate(("f1.png: ", "is 32 x 24 but its depth image 64 x 48", "f10")):
         with pytest.raises(CaperError, match=message):
             data[index]
-
-
-def test_natural_order():
-    names = ["10", "9", "a10", "a9", "09", "a9b", "a"]
-    assert sorted(names, key=natural_order) == [
-        "09", "9", "10", "a", "a9", "a9b", "a10",
-    ]  # fmt: skip

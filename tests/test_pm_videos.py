@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+import roots
 from frames import TRUTH_FIELDS
 
 from caper_jax.data import open_dataset
@@ -70,6 +71,18 @@ def test_videos_are_ordered_and_tell_what_moves(dataset, frames):
 
 def test_videos_of_unsorted_names():
     assert group_videos(["b/2", "a/1", "b/1"]) == {"b": [2, 0], "a": [1]}
+
+
+def test_frames_without_leading_zeros_come_in_the_order_of_time(tmp_path):
+    names = [f"{video}/{frame}" for video in (2, 10) for frame in range(12)]
+    assert group_videos(names[::-1])["2"] == list(range(23, 11, -1))
+    root = roots.pm_videos(tmp_path)
+    for folder in (root / "laptop/train").iterdir():
+        for path in (folder / "annotations").iterdir():
+            path.rename(path.with_name(f"{int(path.stem) + 8}.json"))
+    assert list(PmVideosDataset(root, "laptop").names) == [
+        "00000/8", "00000/9", "00000/10", "00001/11", "00001/12", "00001/13",
+    ]  # fmt: skip
 
 
 def copy_root(root, folder, edit=None):

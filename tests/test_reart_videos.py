@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+import roots
 
 from caper_jax.data import open_dataset
 from caper_jax.data.reart_videos import ReArtVideosDataset
@@ -95,6 +96,15 @@ def test_the_official_split_goes_by_object(mixed, tmp_path):
         ReArtVideosDataset(tmp_path, "box", "test", official_split=True)
     with pytest.raises(CaperError, match="has train and test, not 'all'"):
         ReArtVideosDataset(tmp_path, "box", official_split=True)
+
+
+def test_frames_without_leading_zeros_come_in_the_order_of_time(tmp_path):
+    root = roots.reart_videos(tmp_path)
+    for path in (root / "Data/new_anno_test/box/00000").iterdir():
+        path.rename(path.with_name(f"{int(path.stem) + 9}.json"))
+    dataset = ReArtVideosDataset(root, "box")
+    assert list(dataset.names) == ["00000/9", "00000/10", "00000/11"]
+    assert dataset.videos() == {"00000": [0, 1, 2]}
 
 
 def test_mistakes_are_named(mixed, tmp_path):

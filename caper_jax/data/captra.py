@@ -34,6 +34,7 @@ from caper_jax.data import safe_pickle
 from caper_jax.data.artimage_models import RestModel
 from caper_jax.data.captra_models import read_model
 from caper_jax.data.links import labelled_frame, pose_of_links
+from caper_jax.data.listing import in_natural_order
 from caper_jax.data.schema import Frame, NoFramesError
 from caper_jax.errors import CaperError, unknown_name
 
@@ -162,11 +163,10 @@ class CaptraDataset:
         """Name -> cloud, tracks and frames in the order of their numbers."""
         files = {}
         for place in _PLACES.values() if self.split == ALL else (_PLACES[self.split],):
-            paths = (self.root / place / self._folder).glob("*/*/cloud/*.npz")
-            for path in sorted(paths, key=_numbers):
+            for path in (self.root / place / self._folder).glob("*/*/cloud/*.npz"):
                 name = f"{path.parts[-4]}/{path.parts[-3]}/{path.stem}"
                 files[f"{place}/{name}" if self.split == ALL else name] = path
-        return files
+        return in_natural_order(files)
 
     def _keep_official(self) -> None:
         """Keeps frames whose object the official split puts in this one."""
@@ -195,12 +195,6 @@ class CaptraDataset:
             raise CaperError(f"{path}: lacks {error}") from error
         world_to_camera = _CAMERA_AXES @ np.linalg.inv(camera)
         return [world_to_camera @ link for link in links]
-
-
-def _numbers(path: Path) -> tuple[tuple[bool, int, str], ...]:
-    """Sorts instances, tracks and frames by number, names that are none after them."""
-    words = (path.parts[-4], path.parts[-3], path.stem)
-    return tuple((not w.isdigit(), int(w) if w.isdigit() else 0, w) for w in words)
 
 
 def _matrix(pose: Any, where: str) -> np.ndarray:

@@ -12,7 +12,6 @@ A root is one such folder, or a folder of several. Frames come in the natural or
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.data.cloud import MIN_POINTS, cloud_from_depth
 from caper_jax.data.images import read_depth, read_intrinsics, read_mask
+from caper_jax.data.listing import natural_order
 from caper_jax.data.schema import Frame
 from caper_jax.errors import CaperError
 
@@ -143,10 +143,3 @@ def _depth_images(home: Path) -> list[Path]:
             "mask must be named as its depth image"
         )
     return files
-
-
-def natural_order(name: str) -> tuple[tuple[tuple[bool, int, str], ...], str]:
-    """Sort key that counts runs of digits as numbers: frame2 comes before frame10."""
-    words = re.findall(r"[0-9]+|[^0-9]+", name)
-    numbers = ((False, int(w), "") if w.isdecimal() else (True, 0, w) for w in words)
-    return tuple(numbers), name

@@ -14,13 +14,14 @@ from functools import cached_property
 from pathlib import Path
 
 from caper_jax.data.artimage import ArtImageDataset, read_annotation
+from caper_jax.data.listing import in_natural_order, natural_order
 from caper_jax.errors import CaperError
 
 FORMAT = "pm-videos"
 
 
 def group_videos(names: list[str]) -> dict[str, list[int]]:
-    """Indices of the frames of every video, in the order of their names.
+    """Indices of the frames of every video, in the natural order of their names.
 
     Args:
       names: ``<video>/<frame>``.
@@ -31,7 +32,10 @@ def group_videos(names: list[str]) -> dict[str, list[int]]:
     videos: dict[str, list[int]] = {}
     for index, name in enumerate(names):
         videos.setdefault(name.rpartition("/")[0], []).append(index)
-    return {video: sorted(found, key=names.__getitem__) for video, found in videos.items()}
+    return {
+        video: sorted(found, key=lambda index: natural_order(names[index]))
+        for video, found in videos.items()
+    }
 
 
 class PmVideosDataset(ArtImageDataset):
@@ -67,8 +71,8 @@ class PmVideosDataset(ArtImageDataset):
         return self._model(str(annotation["instances"][0]["urdf_id"])).links.index(link)
 
     def _list_frames(self) -> dict[str, Path]:
-        paths = sorted(self._home.glob(self._annotations))
-        return {f"{path.parent.parent.name}/{path.stem}": path for path in paths}
+        paths = self._home.glob(self._annotations)
+        return in_natural_order({f"{path.parent.parent.name}/{path.stem}": path for path in paths})
 
     @cached_property
     def _names_of_file(self) -> dict[str, list[str]]:

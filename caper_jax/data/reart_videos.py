@@ -29,6 +29,7 @@ from caper_jax.data import safe_pickle
 from caper_jax.data.artimage import ALL, object_of, read_annotation
 from caper_jax.data.images import read_depth, read_intrinsics
 from caper_jax.data.links import labelled_frame, ordered_links, polygon_labels, pose_of_links
+from caper_jax.data.listing import in_natural_order
 from caper_jax.data.pm_videos import group_videos
 from caper_jax.data.public_urdf import ALIGNED, moving_joints
 from caper_jax.data.reartmix_models import CONVERSIONS, Model, read_model
@@ -96,8 +97,8 @@ class ReArtVideosDataset:
         read_intrinsics(self._camera)
         self._intrinsics = lru_cache(maxsize=4)(read_intrinsics)
         self._model = lru_cache(maxsize=None)(self._read_model)
-        paths = sorted(self._annotations.glob("*/*.json"))
-        self._files = {f"{path.parent.name}/{path.stem}": path for path in paths}
+        paths = self._annotations.glob("*/*.json")
+        self._files = in_natural_order({f"{path.parent.name}/{path.stem}": path for path in paths})
         self._select(official_split)
         self.names: Sequence[str] = list(self._files)
         if not self.names:
