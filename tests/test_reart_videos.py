@@ -107,6 +107,12 @@ def test_frames_without_leading_zeros_come_in_the_order_of_time(tmp_path):
     assert dataset.videos() == {"00000": [0, 1, 2]}
 
 
+def test_depth_of_another_size_than_its_annotation_is_named(mixed, tmp_path):
+    make_root(mixed, tmp_path, lambda annotation: annotation.update(width=640, height=360))
+    with pytest.raises(CaperError, match=r"1\.png: image of 1280 x 720, but .* says width 640"):
+        ReArtVideosDataset(tmp_path, "box")[0]
+
+
 def test_mistakes_are_named(mixed, tmp_path):
     make_root(mixed, tmp_path)
     flags = tmp_path / "Data/new_anno_test/flag/box"

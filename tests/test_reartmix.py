@@ -118,6 +118,25 @@ def test_an_instance_without_depth_has_no_points(root, tmp_path):
     assert ReArtMixDataset(tmp_path, "box")[0].points.shape == (0, 3)
 
 
+def halve(path):
+    with Image.open(path) as image:
+        image.resize((640, 360), Image.Resampling.NEAREST).save(path)
+
+
+def test_depth_of_another_size_than_its_camera_or_annotation_is_named(root, tmp_path):
+    copy_frame(root, tmp_path / "a")
+    halve(tmp_path / "a/depth/scene6/000001.png")
+    with pytest.raises(
+        CaperError, match=r"1\.png: image of 640 x 360, but .* width 1280, height 720"
+    ):
+        ReArtMixDataset(tmp_path / "a", "box")[0]
+    copy_frame(root, tmp_path / "b", lambda a: (a.pop("width"), a.pop("height")))
+    assert len(ReArtMixDataset(tmp_path / "b", "box")[0].points) == 1024
+    halve(tmp_path / "b/depth/scene6/000001.png")
+    with pytest.raises(CaperError, match="made for 1280 x 720 images, this one is 640 x 360"):
+        ReArtMixDataset(tmp_path / "b", "box")[0]
+
+
 def set_transformation(value):
     def edit(annotation):
         annotation["instances"][0]["links"][0]["transformation"] = value

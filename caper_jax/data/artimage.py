@@ -26,7 +26,7 @@ from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.data.artimage_models import RestModel, read_model
 from caper_jax.data.images import read_depth, read_intrinsics, read_json, read_labels
-from caper_jax.data.links import labelled_frame, ordered_links, pose_of_links
+from caper_jax.data.links import check_image_size, labelled_frame, ordered_links, pose_of_links
 from caper_jax.data.schema import Frame, NoFramesError
 from caper_jax.errors import CaperError
 
@@ -130,13 +130,8 @@ class ArtImageDataset:
         depth_path = path.parent.parent / annotation["depth_path"]
         mask_path = path.parent.parent / annotation["depth_path"].replace("depth", "category_mask")
         depth, labels = read_depth(depth_path), read_labels(mask_path)
-        stated = (annotation["height"], annotation["width"])
-        for file, image in ((depth_path, depth), (mask_path, labels)):
-            if image.shape != stated:
-                raise CaperError(
-                    f"{file}: image of {image.shape[1]} x {image.shape[0]}, but {path} says width "
-                    f"{stated[1]}, height {stated[0]}"
-                )
+        check_image_size(depth_path, depth, annotation, path)
+        check_image_size(mask_path, labels, annotation, path)
         # Background carries a label that is no part (255 in the sample data).
         part_of_label = np.full(max(int(labels.max()), self.category.num_parts) + 1, -1)
         part_of_label[list(model.links)] = np.arange(self.category.num_parts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -66,6 +67,27 @@ def split_transformation(value: Any, where: str) -> tuple[float, np.ndarray, np.
     if drift > _SCALE_TOLERANCE:
         raise CaperError(f"{where}: transformation is no scaled rotation (off by {drift:.2g})")
     return scale, rotation, matrix[:3, 3]
+
+
+def check_image_size(path: Path, image: np.ndarray, annotation: dict[str, Any], by: Path) -> None:
+    """Refuses an image [H, W] of another size than its annotation states, where it states one.
+
+    Args:
+      path: file of the image.
+      image: what was read from it.
+      annotation: content of the annotation.
+      by: file of the annotation.
+
+    Raises:
+      CaperError: names both files and both sizes.
+    """
+    height, width = image.shape
+    stated = annotation.get("width", width), annotation.get("height", height)
+    if stated != (width, height):
+        raise CaperError(
+            f"{path}: image of {width} x {height}, but {by} says width {stated[0]}, height "
+            f"{stated[1]}"
+        )
 
 
 def polygon_labels(links: list[dict[str, Any]], shape: tuple[int, ...], where: str) -> np.ndarray:

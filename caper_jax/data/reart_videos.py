@@ -28,7 +28,13 @@ from caper_jax.articulation.category import Category
 from caper_jax.data import safe_pickle
 from caper_jax.data.artimage import ALL, object_of, read_annotation
 from caper_jax.data.images import read_depth, read_intrinsics
-from caper_jax.data.links import labelled_frame, ordered_links, polygon_labels, pose_of_links
+from caper_jax.data.links import (
+    check_image_size,
+    labelled_frame,
+    ordered_links,
+    polygon_labels,
+    pose_of_links,
+)
 from caper_jax.data.listing import in_natural_order
 from caper_jax.data.pm_videos import group_videos
 from caper_jax.data.public_urdf import ALIGNED, moving_joints
@@ -131,7 +137,9 @@ class ReArtVideosDataset:
         urdf_id = str(instance["urdf_id"])
         model = self._model(urdf_id)
         truth = pose_of_links(model, links, self.category, where, scaled=True)
-        depth = read_depth(self.root / "Data" / "depth" / annotation["depth_path"])
+        depth_path = self.root / "Data" / "depth" / annotation["depth_path"]
+        depth = read_depth(depth_path)
+        check_image_size(depth_path, depth, annotation, path)
         labels = polygon_labels(links, depth.shape, where)
         intrinsics = self._intrinsics(self._camera, depth.shape)
         return labelled_frame(name, depth, labels, intrinsics, truth, self._num_points, urdf_id)

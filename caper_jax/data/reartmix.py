@@ -23,7 +23,13 @@ from typing import Any
 from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.data.images import read_depth, read_intrinsics, read_json
-from caper_jax.data.links import labelled_frame, ordered_links, polygon_labels, pose_of_links
+from caper_jax.data.links import (
+    check_image_size,
+    labelled_frame,
+    ordered_links,
+    polygon_labels,
+    pose_of_links,
+)
 from caper_jax.data.reartmix_models import CONVERSIONS, Model, conversion_of, read_model
 from caper_jax.data.schema import Frame, NoFramesError
 from caper_jax.errors import CaperError
@@ -79,7 +85,9 @@ class ReArtMixDataset:
         self.split = split or ALL
         self._num_points = num_points
         self._on_broken = on_broken
-        self._intrinsics = read_intrinsics(self.root / "camera_intrinsic.json")
+        self._camera = self.root / "camera_intrinsic.json"
+        read_intrinsics(self._camera)
+        self._intrinsics = lru_cache(maxsize=4)(read_intrinsics)
         self._models = self._load_models()
         self.names: Sequence[str] = self._list_names()
         self._annotation = lru_cache(maxsize=4)(self._read_annotation)
@@ -116,17 +124,13 @@ class ReArtMixDataset:
             raise CaperError(f"{where}: urdf_id {instance['urdf_id']} is not in urdf_metas.json")
         model = self._models[instance["urdf_id"]]
         truth = pose_of_links(model, links, self.category, where, scaled=True)
-        depth = read_depth(self.root / "depth" / annotation["depth_path"])
+        depth_path = self.root / "depth" / annotation["depth_path"]
+        depth = read_depth(depth_path)
+        check_image_size(depth_path, depth, annotation, self._path(image_name))
         labels = polygon_labels(links, depth.shape, where)
-        return labelled_frame(
-            name,
-            depth,
-            labels,
-            self._intrinsics,
-            truth,
-            self._num_points,
-            str(instance["urdf_id"]),
-        )
+        intrinsics = self._intrinsics(self._camera, depth.shape)
+        urdf_id = str(instance["urdf_id"])
+        return labelled_frame(name, depth, labels, intrinsics, truth, self._num_points, urdf_id)
 
     def _load_models(self) -> dict[int, Model]:
         path = self.root / "urdf_metas.json"
