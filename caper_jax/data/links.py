@@ -16,6 +16,7 @@ from caper_jax.data.schema import Frame
 from caper_jax.errors import CaperError
 
 _SCALE_TOLERANCE = 1e-3
+_FAR_PIXEL = 1e6  # no image is as large
 
 
 def ordered_links(
@@ -94,16 +95,24 @@ def polygon_labels(links: list[dict[str, Any]], shape: tuple[int, ...], where: s
     """[H, W] int: part of every pixel, -1 outside; polygons include their outline.
 
     Raises:
-      CaperError: a polygon that is no list of pairs of numbers.
+      CaperError: a segmentation that is no list of polygons, or a polygon that is no list of pairs
+        of finite coordinates.
     """
     canvas = Image.new("L", (shape[1], shape[0]), 0)
     draw = ImageDraw.Draw(canvas)
     for part, link in enumerate(links):
-        for polygon in link["segmentation"]:
-            if not isinstance(polygon, list):
-                raise CaperError(f"{where}: segmentation of part {part} must be a list of polygons")
+        polygons = link["segmentation"]
+        if not isinstance(polygons, list) or not all(isinstance(p, list) for p in polygons):
+            raise CaperError(f"{where}: segmentation of part {part} must be a list of polygons")
+        for polygon in polygons:
             if len(polygon) % 2:
                 raise CaperError(f"{where}: a polygon has an odd number of coordinates")
+            for value in polygon:
+                # Not NaN either, which Pillow draws as anything.
+                if not isinstance(value, (int, float)) or not -_FAR_PIXEL < value < _FAR_PIXEL:
+                    raise CaperError(
+                        f"{where}: a polygon of part {part} must hold pixels, got {value!r}"
+                    )
             if len(polygon) >= 6:
                 draw.polygon(polygon, fill=part + 1)
     return np.asarray(canvas).astype(np.int64) - 1

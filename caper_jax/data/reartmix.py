@@ -207,4 +207,13 @@ class ReArtMixDataset:
             missing += [key for key in _INSTANCE_KEYS if key not in instance]
         if missing:
             raise CaperError(f"{path}: no ReArtMix annotation, it lacks {missing[0]!r}")
+        ids = [instance["id"] for instance in content["instances"]]
+        for number in ids:
+            if isinstance(number, bool) or not isinstance(number, int):
+                raise CaperError(
+                    f"{path}: the id of an instance must be an integer, got {number!r}"
+                )
+            # A frame is named by it.
+            if ids.count(number) > 1:
+                raise CaperError(f"{path}: {ids.count(number)} instances have the id {number}")
         return content
