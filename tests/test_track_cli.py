@@ -279,6 +279,21 @@ class TestLive:
         assert numbers == sorted(set(numbers)) and numbers[-1] == 39
         assert len(records) + sum(record["skipped"] for record in records) == 40
 
+    def test_a_stream_can_be_left_while_the_sender_pauses(self):
+        with socket.create_server(("localhost", 0)) as server:
+
+            def follow():
+                with track_live.open_stream(f"localhost:{server.getsockname()[1]}") as frames:
+                    next(iter(frames))
+
+            thread = threading.Thread(target=follow, daemon=True)
+            thread.start()
+            connection, _ = server.accept()
+            with connection:
+                connection.sendall(pack_frame(CLOUD, 0))
+                thread.join(10)
+                assert not thread.is_alive()
+
     def test_nobody_listening_is_named(self, scripted, capsys):
         with socket.create_server(("localhost", 0)) as server:
             port = server.getsockname()[1]

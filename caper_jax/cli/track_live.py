@@ -6,7 +6,7 @@ import socket
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import jax
 import numpy as np
@@ -48,7 +48,12 @@ def open_stream(source: str) -> Iterator[Iterable[LiveFrame]]:
         ) from error
     with connection, connection.makefile("rb") as stream:
         connection.settimeout(None)  # a camera may pause
-        yield Newest(read_frames(stream))
+        try:
+            yield Newest(read_frames(stream))
+        finally:
+            # Its thread may wait for a frame, and nobody can close what is being read.
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
 
 
 def track_stream(tracker: Tracker, frames: Iterable[LiveFrame]) -> None:
