@@ -43,6 +43,23 @@ def test_a_root_of_several_videos(tmp_path):
     assert list(data.names) == ["take2/a", "take2/b", "take10/a"]
 
 
+def test_linked_videos_keep_their_own_names(tmp_path):
+    """Their folders are both called rgbd."""
+    root = tmp_path / "root"
+    root.mkdir()
+    for name, frames in (("kitchen", ("a", "b")), ("office", ("a",))):
+        (root / name).symlink_to(write_video(tmp_path / name / "rgbd", frames))
+    data = DepthFolder(root, "laptop")
+    assert data.videos() == {"kitchen": [0, 1], "office": [2]}
+    assert list(data.names) == ["kitchen/a", "kitchen/b", "office/a"]
+
+
+@pytest.mark.parametrize(("here", "given"), [("", "."), ("depth", "..")])
+def test_the_video_one_is_in_has_its_folders_name(tmp_path, monkeypatch, here, given):
+    monkeypatch.chdir(write_video(tmp_path / "kitchen", ("a",)) / here)
+    assert list(DepthFolder(given, "laptop").names) == ["kitchen/a"]
+
+
 def test_frames_that_do_not_show_the_object_have_no_points(tmp_path):
     home = write_video(tmp_path / "kitchen", ("1", "2", "3", "4", "5"))
     (home / "mask" / "2.png").unlink()

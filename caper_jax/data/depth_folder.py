@@ -70,7 +70,7 @@ class DepthFolder:
         for home in _homes(self.root):
             files = _depth_images(home)
             read_intrinsics(home / _CAMERA)
-            first, name = len(self._files), home.resolve().name
+            first, name = len(self._files), _name(home)
             self._videos[name] = list(range(first, first + len(files)))
             self._files |= {f"{name}/{file.stem}": file for file in files}
         self.names: Sequence[str] = list(self._files)
@@ -126,6 +126,11 @@ def _homes(root: Path) -> list[Path]:
             f"{root}: no video of depth images (it has no folder {_DEPTH}/, nor has a folder in it)"
         )
     return homes
+
+
+def _name(home: Path) -> str:
+    """The name of a folder, as given: links of different names may lead to folders of the same."""
+    return home.resolve().name if home.name in ("", "..") else home.name
 
 
 def _depth_images(home: Path) -> list[Path]:
