@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from caper_jax.data.images import read_depth, read_intrinsics, read_labels, read_mask
+from caper_jax.data.images import read_depth, read_intrinsics, read_json, read_labels, read_mask
 from caper_jax.errors import CaperError
 
 
@@ -214,3 +214,17 @@ def test_broken_json_is_named_with_its_place(tmp_path):
         read_intrinsics(path)
     with pytest.raises(CaperError, match="no such file"):
         read_intrinsics(tmp_path / "absent.json")
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, "1" * 5000])
+def test_json_beyond_what_python_reads_is_named(tmp_path, content):
+    path = tmp_path / "camera.json"
+    path.write_text(content)
+    with pytest.raises(CaperError, match=r"camera\.json: cannot be read as JSON"):
+        read_json(path)
+
+
+@pytest.mark.parametrize("read", [read_json, read_depth])
+def test_a_name_that_no_file_can_have_is_named(tmp_path, read):
+    with pytest.raises(CaperError, match=r"xxx\.npy: (cannot be read|no such file)"):
+        read(tmp_path / f"{'x' * 5000}.npy")

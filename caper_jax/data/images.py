@@ -159,9 +159,7 @@ def read_array(path: str | Path, colours: bool = False) -> np.ndarray:
     Raises:
       CaperError: the file is missing, broken, or would need unpickling.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise CaperError(f"{path}: no such file")
+    path = _file(path)
     try:
         if path.suffix.lower() == ".npy":
             return np.load(path, allow_pickle=False)
@@ -175,15 +173,26 @@ def read_array(path: str | Path, colours: bool = False) -> np.ndarray:
         raise CaperError(f"{path}: broken or truncated file ({error})") from error
 
 
+def _file(path: str | Path) -> Path:
+    """The path of a file that exists; CaperError without one."""
+    path = Path(path)
+    try:
+        found = path.is_file()
+    except OSError as error:  # a name that is too long, a folder that may not be entered
+        raise CaperError(f"{path}: cannot be read ({error.strerror})") from error
+    if not found:
+        raise CaperError(f"{path}: no such file")
+    return path
+
+
 def read_json(path: str | Path) -> Any:
     """The content of a JSON file.
 
     Raises:
-      CaperError: missing file, or broken JSON, with line and column.
+      CaperError: missing file, broken JSON, with line and column, or content beyond what Python
+        reads (thousands of brackets in each other, or of digits).
     """
-    path = Path(path)
-    if not path.is_file():
-        raise CaperError(f"{path}: no such file")
+    path = _file(path)
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except json.JSONDecodeError as error:
@@ -192,6 +201,8 @@ def read_json(path: str | Path) -> Any:
         ) from error
     except UnicodeDecodeError as error:
         raise CaperError(f"{path}: not a JSON text file ({error.reason})") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise CaperError(f"{path}: cannot be read as JSON ({error})") from error
 
 
 def read_intrinsics(path: str | Path, image_shape: tuple[int, int] | None = None) -> np.ndarray:
