@@ -27,6 +27,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.data.artimage_models import RestModel, read_model
 from caper_jax.data.images import read_depth, read_intrinsics, read_json, read_labels
 from caper_jax.data.links import check_image_size, labelled_frame, ordered_links, pose_of_links
+from caper_jax.data.listing import list_splits, read_list
 from caper_jax.data.schema import Frame, NoFramesError
 from caper_jax.errors import CaperError
 
@@ -109,7 +110,7 @@ class ArtImageDataset:
     @staticmethod
     def splits_in(root: Path, category: str) -> list[str]:
         """Splits that a root lists frames of, for one category."""
-        return sorted(path.stem for path in (root / category).glob("*.txt"))
+        return list_splits(root / category)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -163,12 +164,11 @@ class ArtImageDataset:
         """Lines of the split's text file."""
         path = self._home / f"{self.split}.txt"
         if not path.is_file():
-            present = sorted(p.stem for p in self._home.glob("*.txt"))
             raise CaperError(
                 f"{self._home}: no split {self.split!r} (no {path.name}); it has "
-                f"{', '.join([ALL, *present])}"
+                f"{', '.join([ALL, *list_splits(self._home)])}"
             )
-        return path.read_text(encoding="utf-8").split()
+        return read_list(path)
 
     def _keep_listed(self, lines: list[str]) -> None:
         """Keeps the frames that a text file lists, in its order."""

@@ -35,7 +35,7 @@ from caper_jax.data.links import (
     polygon_labels,
     pose_of_links,
 )
-from caper_jax.data.listing import in_natural_order
+from caper_jax.data.listing import in_natural_order, list_splits, read_list
 from caper_jax.data.pm_videos import group_videos
 from caper_jax.data.public_urdf import ALIGNED, moving_joints
 from caper_jax.data.reartmix_models import CONVERSIONS, Model, read_model
@@ -120,7 +120,7 @@ class ReArtVideosDataset:
     def splits_in(root: Path, category: str) -> list[str]:
         """Splits that a root lists frames of, for one category."""
         folder = root / "Data" / "new_anno_test" / "flag" / _folder(category)
-        return sorted(path.stem for path in folder.glob("*.txt"))
+        return list_splits(folder)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -154,7 +154,7 @@ class ReArtVideosDataset:
         if self.split != ALL and (listed.is_file() or not official):
             if not listed.is_file():
                 raise CaperError(f"{self.root}: no split {self.split!r} (no {listed})")
-            wanted = {line.removesuffix(".json") for line in listed.read_text().split()}
+            wanted = {line.removesuffix(".json") for line in read_list(listed)}
             missing = wanted - {path.stem for path in self._files.values()} - set(self._files)
             if missing:
                 raise CaperError(f"{listed}: names {min(missing)!r}, which has no annotation")

@@ -30,6 +30,7 @@ from caper_jax.data.links import (
     polygon_labels,
     pose_of_links,
 )
+from caper_jax.data.listing import list_splits, read_list
 from caper_jax.data.reartmix_models import CONVERSIONS, Model, conversion_of, read_model
 from caper_jax.data.schema import Frame, NoFramesError
 from caper_jax.errors import CaperError
@@ -107,7 +108,7 @@ class ReArtMixDataset:
     @staticmethod
     def splits_in(root: Path, category: str) -> list[str]:
         """Splits that a root lists, of all categories together."""
-        return sorted(path.stem for path in root.glob("*.txt"))
+        return list_splits(root)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -161,12 +162,11 @@ class ReArtMixDataset:
         else:
             path = self.root / f"{self.split}.txt"
             if not path.is_file():
-                present = sorted(p.stem for p in self.root.glob("*.txt"))
                 raise CaperError(
                     f"{self.root}: no split {self.split!r} (no {path.name}); it has "
-                    f"{', '.join([ALL, *present])}"
+                    f"{', '.join([ALL, *list_splits(self.root)])}"
                 )
-            wanted = path.read_text(encoding="utf-8").split()
+            wanted = read_list(path)
             images = list(dict.fromkeys(name.rpartition("_")[0] for name in wanted))
         found: dict[str, bool] = {}
         broken: set[str] = set()
