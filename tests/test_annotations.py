@@ -4,8 +4,10 @@ import json
 
 import pytest
 import roots
+from formats import FORMATS, write_root
 
-from caper_jax.data.links import polygon_labels
+from caper_jax.data import open_dataset
+from caper_jax.data.links import polygon_labels, split_transformation
 from caper_jax.data.reartmix import ReArtMixDataset
 from caper_jax.errors import CaperError
 
@@ -24,6 +26,30 @@ from caper_jax.errors import CaperError
 def test_polygons(polygons, message):
     with pytest.raises(CaperError, match=f"file: .*{message}"):
         polygon_labels([{"segmentation": polygons}], (8, 8), "file")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"instances": None}, "instances must be a list of objects, got None"),
+        ({"instances": [5]}, "instances must be a list of objects, got another list"),
+        ({"instances": [{"id": 0, "category_id": 1, "urdf_id": 5, "links": 3}]}, "links must be"),
+        ({"instances": [{"id": 0, "category_id": 1, "urdf_id": 5, "links": ["a"]}]}, "links must"),
+        ({"depth_path": None}, "depth_path must be text, got None"),
+    ],
+)
+@pytest.mark.parametrize("format", ["artimage", "pm-videos", "reart-videos", "reartmix"])
+def test_values_of_another_type(tmp_path, format, change, message):
+    root = write_root(format, tmp_path)
+    path = next(tmp_path.glob("**/000000.json"))
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(CaperError, match=rf"000000\.json: {message}"):
+        open_dataset(format, root, FORMATS[format][0])[0]
+
+
+def test_a_transformation_of_endless_numbers():
+    with pytest.raises(CaperError, match="file: transformation must be 4x4 finite numbers"):
+        split_transformation([[10**400] * 4] * 4, "file")
 
 
 @pytest.mark.parametrize(

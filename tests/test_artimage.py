@@ -215,7 +215,7 @@ def set_transformation(value):
         (lambda a: a.update(width=320), "640 x 640, but .* width 320"),
         (lambda a: a["instances"].append(a["instances"][0]), "2 instances, expected exactly one"),
         (lambda a: a.pop("height"), "it lacks 'height'"),
-        (lambda a: a["instances"][0].pop("links"), "the instance lacks 'links'"),
+        (lambda a: a["instances"][0].pop("links"), "an instance lacks 'links'"),
     ],
 )
 def test_bad_annotations_are_named(root, tmp_path, edit, message):

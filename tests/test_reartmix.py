@@ -164,7 +164,7 @@ def test_bad_annotations_are_named(root, tmp_path, edit, message):
 
 def test_annotations_of_another_kind_are_named(root, tmp_path):
     copy_frame(root, tmp_path, lambda a: a["instances"][0].pop("category_id"))
-    with pytest.raises(CaperError, match=r"000001\.json: no ReArtMix annotation.*'category_id'"):
+    with pytest.raises(CaperError, match=r"000001\.json: an instance lacks 'category_id'"):
         ReArtMixDataset(tmp_path, "box")
 
 

@@ -25,8 +25,14 @@ import numpy as np
 from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.data.artimage_models import RestModel, read_model
-from caper_jax.data.images import read_depth, read_intrinsics, read_json, read_labels
-from caper_jax.data.links import check_image_size, labelled_frame, ordered_links, pose_of_links
+from caper_jax.data.images import read_depth, read_intrinsics, read_labels
+from caper_jax.data.links import (
+    check_image_size,
+    checked_annotation,
+    labelled_frame,
+    ordered_links,
+    pose_of_links,
+)
 from caper_jax.data.listing import list_splits, read_list
 from caper_jax.data.schema import Frame, NoFramesError
 from caper_jax.errors import CaperError
@@ -241,21 +247,9 @@ def read_annotation(path: Path) -> dict[str, Any]:
     Raises:
       CaperError: missing or broken file, or one that lacks a key.
     """
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise CaperError(f"{path}: no annotation, it is no JSON object")
-    missing = [key for key in ("depth_path", "width", "height", "instances") if key not in content]
-    if missing:
-        raise CaperError(f"{path}: no annotation, it lacks {missing[0]!r}")
-    instances = content["instances"]
-    if not isinstance(instances, list) or len(instances) != 1:
-        count = len(instances) if isinstance(instances, list) else "no list of"
-        raise CaperError(f"{path}: {count} instances, expected exactly one")
-    missing = [key for key in ("urdf_id", "links") if key not in instances[0]]
-    if missing:
-        raise CaperError(f"{path}: the instance lacks {missing[0]!r}")
-    if not isinstance(content["depth_path"], str):
-        raise CaperError(f"{path}: depth_path must be text, got {content['depth_path']!r}")
+    content = checked_annotation(path, ("width", "height"), ("urdf_id",))
+    if len(content["instances"]) != 1:
+        raise CaperError(f"{path}: {len(content['instances'])} instances, expected exactly one")
     return content
 
 

@@ -11,12 +11,52 @@ from PIL import Image, ImageDraw
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.cloud import MIN_POINTS, cloud_from_depth
+from caper_jax.data.images import read_json
 from caper_jax.data.reartmix_models import Model
 from caper_jax.data.schema import Frame
 from caper_jax.errors import CaperError
 
 _SCALE_TOLERANCE = 1e-3
 _FAR_PIXEL = 1e6  # no image is as large
+
+
+def checked_annotation(
+    path: Path, keys: tuple[str, ...], instance_keys: tuple[str, ...]
+) -> dict[str, Any]:
+    """The content of an annotation, of which depth_path, instances and links have their types.
+
+    Args:
+      path: the file.
+      keys: what it must have besides depth_path and instances.
+      instance_keys: what every instance must have besides links.
+
+    Raises:
+      CaperError: missing or broken file, one that lacks a key, or a value of another type.
+    """
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise CaperError(f"{path}: no annotation, it is no JSON object")
+    _require(content, ("depth_path", "instances", *keys), f"{path}: no annotation, it")
+    if not isinstance(content["depth_path"], str):
+        raise CaperError(f"{path}: depth_path must be text, got {content['depth_path']!r}")
+    for instance in _objects(content["instances"], f"{path}: instances"):
+        _require(instance, ("links", *instance_keys), f"{path}: an instance")
+        _objects(instance["links"], f"{path}: links")
+    return content
+
+
+def _require(content: dict[str, Any], keys: tuple[str, ...], what: str) -> None:
+    missing = [key for key in keys if key not in content]
+    if missing:
+        raise CaperError(f"{what} lacks {missing[0]!r}")
+
+
+def _objects(value: Any, where: str) -> list[dict[str, Any]]:
+    """A list of JSON objects; CaperError for anything else."""
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        found = "another list" if isinstance(value, list) else repr(value)
+        raise CaperError(f"{where} must be a list of objects, got {found}")
+    return value
 
 
 def ordered_links(
@@ -55,7 +95,7 @@ def split_transformation(value: Any, where: str) -> tuple[float, np.ndarray, np.
     """
     try:
         matrix = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise CaperError(f"{where}: transformation must be 4x4 finite numbers") from error
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise CaperError(f"{where}: transformation must be 4x4 finite numbers")

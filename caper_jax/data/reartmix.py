@@ -25,6 +25,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.data.images import read_depth, read_intrinsics, read_json
 from caper_jax.data.links import (
     check_image_size,
+    checked_annotation,
     labelled_frame,
     ordered_links,
     polygon_labels,
@@ -38,7 +39,7 @@ from caper_jax.errors import CaperError
 FORMAT = "reartmix"
 ALL = "all"
 _CATEGORY_ID = re.compile(rb'"category_id"\s*:\s*(\d+)')
-_INSTANCE_KEYS = ("id", "category_id", "urdf_id", "links")
+_INSTANCE_KEYS = ("id", "category_id", "urdf_id")
 
 
 class ReArtMixDataset:
@@ -199,14 +200,7 @@ class ReArtMixDataset:
 
     def _read_annotation(self, image_name: str) -> dict[str, Any]:
         path = self._path(image_name)
-        content = read_json(path)
-        if not isinstance(content, dict):
-            raise CaperError(f"{path}: no ReArtMix annotation, it is no JSON object")
-        missing = [key for key in ("depth_path", "instances") if key not in content]
-        for instance in content.get("instances", ()):
-            missing += [key for key in _INSTANCE_KEYS if key not in instance]
-        if missing:
-            raise CaperError(f"{path}: no ReArtMix annotation, it lacks {missing[0]!r}")
+        content = checked_annotation(path, (), _INSTANCE_KEYS)
         ids = [instance["id"] for instance in content["instances"]]
         for number in ids:
             if isinstance(number, bool) or not isinstance(number, int):
