@@ -253,9 +253,10 @@ def test_bad_models_are_named(root, tmp_path, file, old, new, message):
 
 def test_missing_files_are_named(root, tmp_path):
     copy_root(root, tmp_path)
-    (tmp_path / "laptop/urdf/913329/part_point_sample/0.xyz").write_text("\n")
-    with pytest.raises(CaperError, match=r"0\.xyz: holds no points"):
-        ArtImageDataset(tmp_path, "laptop")[0]
+    for nothing in ("\n", "# x y z\n"):
+        (tmp_path / "laptop/urdf/913329/part_point_sample/0.xyz").write_text(nothing)
+        with pytest.raises(CaperError, match=r"0\.xyz: holds no points"):
+            ArtImageDataset(tmp_path, "laptop")[0]
     (tmp_path / "laptop/urdf/913329/part_point_sample/0.xyz").unlink()
     with pytest.raises(CaperError, match=r"0\.xyz: no such file"):
         ArtImageDataset(tmp_path, "laptop")[0]

@@ -199,8 +199,8 @@ def _read_points(path: Path) -> np.ndarray:
     if not path.is_file():
         raise CaperError(f"{path}: no such file (points of a part)")
     try:
-        lines = path.read_text().splitlines()
-        points = np.loadtxt(lines, np.float64, usecols=(0, 1, 2), ndmin=2) if any(lines) else None
+        lines = [line for line in path.read_text().splitlines() if line.partition("#")[0].strip()]
+        points = np.loadtxt(lines, np.float64, usecols=(0, 1, 2), ndmin=2) if lines else None
     except ValueError as error:
         raise CaperError(f"{path}: lines must hold three numbers x y z ({error})") from error
     if points is None or not np.isfinite(points).all():
