@@ -164,6 +164,27 @@ def test_damaged_files_are_named(tmp_path):
             Hdf5Dataset(path)
 
 
+def test_text_in_another_encoding_is_named(tmp_path):
+    path = tmp_path / "box.h5"
+    write_box(path)
+    with h5py.File(path, "r+") as file:
+        file["name"][0] = "Büchse".encode("latin-1")
+    with pytest.raises(CaperError, match=r"box\.h5: name is not UTF-8"):
+        Hdf5Dataset(path)
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyError, TypeError])
+def test_whatever_h5py_makes_of_damage_is_named(tmp_path, monkeypatch, error):
+    write_box(tmp_path / "box.h5")
+
+    def fail(*_):
+        raise error("bad object header version number")
+
+    monkeypatch.setattr(h5py.AttributeManager, "__iter__", fail)
+    with pytest.raises(CaperError, match=r"box\.h5: corrupted .*bad object header"):
+        Hdf5Dataset(tmp_path / "box.h5")
+
+
 def test_objects_are_never_unpickled(tmp_path):
     path = tmp_path / "box.h5"
     write_box(path)

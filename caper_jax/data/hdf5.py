@@ -222,8 +222,12 @@ def _opened(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             yield file
+    except CaperError:
+        raise
     except OSError as error:
         raise CaperError(f"{path}: truncated or not an HDF5 file ({error})") from error
+    except (RuntimeError, KeyError, TypeError, ValueError) as error:  # what h5py makes of damage
+        raise CaperError(f"{path}: corrupted HDF5 file ({error})") from error
 
 
 def _read_attributes(path: Path, file: h5py.File) -> dict[str, Any]:
@@ -291,6 +295,11 @@ def _check_arrays(where: str, arrays: dict[str, np.ndarray], category: Category)
         problems.append(f"name is {names.dtype} {names.shape}, expected bytes ({frames},)")
     elif len(set(names.tolist())) != frames:
         problems.append("name has duplicates")
+    else:
+        try:
+            b"\n".join(names.tolist()).decode()
+        except UnicodeDecodeError:
+            problems.append("name is not UTF-8")
     if not problems:
         if ((arrays["labels"] < -1) | (arrays["labels"] >= parts)).any():
             problems.append(f"labels must be -1 (unknown) to {parts - 1}")
