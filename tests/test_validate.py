@@ -1,6 +1,7 @@
 """``caper validate``: clean data pass in every format; all that is wrong is listed in one run."""
 
 import json
+import os
 
 import h5py
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image
 
 from caper_jax import cli
 from caper_jax.cli.validate import format_report
+from caper_jax.data.artimage import ArtImageDataset
 from caper_jax.data.validation import CategoryReport, Problem
 
 
@@ -128,6 +130,42 @@ def test_broken_annotations_of_reartmix_hide_nothing(tmp_path):
     assert code == 1
     assert "000000.json: broken JSON" in first and "000001.png: no such file" in second
     assert report["frames"] == 2 and report["splits"] == {"train": 2}
+
+
+def test_what_no_reader_expects_is_a_problem_too(tmp_path, monkeypatch):
+    """One frame, or one split, must not cost the report of the others."""
+    root = roots.artimage(tmp_path / "root")
+    get, open_one = ArtImageDataset.__getitem__, ArtImageDataset._read_list
+
+    def item(self, index):
+        if self.names[index] == "000001":
+            raise RecursionError("too\ndeep")
+        return get(self, index)
+
+    def listed(self):
+        if self.split == "train":
+            raise IndexError("far out")
+        return open_one(self)
+
+    monkeypatch.setattr(ArtImageDataset, "__getitem__", item)
+    monkeypatch.setattr(ArtImageDataset, "_read_list", listed)
+    code, (report,) = report_of(tmp_path, "artimage", root)
+    assert code == 1 and report["frames"] == 6 and report["bad_frames"] == 1
+    assert report["splits"] == {"test": 3, "train": None}
+    assert messages(report) == [
+        f"{root}: unreadable (IndexError: far out)",
+        "000001: unreadable (RecursionError: too deep)",
+    ]
+
+
+def test_file_names_that_are_not_utf_8_are_escaped(tmp_path, capsys):
+    root = roots.artimage(tmp_path / "root")
+    broken = os.fsencode(root / "laptop/train/annotations") + b"/B\xfcchse.json"
+    with open(broken, "w") as file:
+        file.write("{")
+    code, (report,) = report_of(tmp_path, "artimage", root)
+    assert code == 1 and "B\udcfcchse.json: broken JSON" in messages(report)[0]
+    assert r"B\udcfcchse.json: broken JSON" in capsys.readouterr().out
 
 
 def test_damaged_files(tmp_path, capsys):

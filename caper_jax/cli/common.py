@@ -68,6 +68,12 @@ def report_error(command: str, message: str) -> int:
     return EXIT_USAGE
 
 
+def printable(text: str) -> str:
+    """Text that standard output can take: escapes what its encoding lacks, e.g. of file names."""
+    encoding = sys.stdout.encoding or "utf-8"
+    return text.encode(encoding, "backslashreplace").decode(encoding)
+
+
 def create_parser(
     command: str, description: str, examples: Sequence[tuple[str, str]]
 ) -> argparse.ArgumentParser:

@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 arguments.format, arguments.data, name, arguments.split, arguments.workers
             )
         )
-    print(format_report(reports))
+    print(common.printable(format_report(reports)))
     if arguments.json is not None:
         content = {
             "format": arguments.format,

@@ -79,15 +79,15 @@ def check_category(
     report = CategoryReport(category)
     messages: dict[str, None] = {}
 
-    def note(error: CaperError) -> None:
-        messages.setdefault(one_line(error))
+    def note(error: Exception) -> None:
+        messages.setdefault(_finding(error, str(root)))
 
     def opened(name: str | None) -> Dataset:
         return open_dataset(format, root, category, name, on_broken=note)
 
     try:
         listed = splits_in(format, root, category)
-    except CaperError as error:
+    except Exception as error:
         note(error)
         listed = []
     for name in listed:
@@ -95,13 +95,13 @@ def check_category(
             report.splits[name] = len(opened(name))
         except NoFramesError:
             report.splits[name] = 0  # e.g. an empty list of test frames
-        except CaperError as error:
+        except Exception as error:
             report.splits[name] = None
             note(error)
     dataset = None
     try:
         dataset = opened(split)
-    except CaperError as error:
+    except Exception as error:
         note(error)
     report.problems = [Problem(message) for message in messages]
     if dataset is not None:
@@ -114,10 +114,10 @@ def _check_frames(dataset: Dataset, report: CategoryReport, workers: int) -> Non
         name = dataset.names[index]
         try:
             frame = dataset[index]
-        except CaperError as error:
-            return None, False, [Problem(one_line(error), name)]
-        few = len(frame.points) < MIN_POINTS
-        return frame.instance, few, check_frame(frame, dataset.category)
+            problems = check_frame(frame, dataset.category)
+        except Exception as error:
+            return None, False, [Problem(_finding(error, name), name)]
+        return frame.instance, len(frame.points) < MIN_POINTS, problems
 
     results = []
     with (
@@ -178,6 +178,17 @@ def _misplaced(frame: Frame, category: Category) -> list[str]:
     return phrases
 
 
-def one_line(error: CaperError) -> str:
+def one_line(error: Exception) -> str:
     """The error's message without line breaks."""
     return " ".join(str(error).split())
+
+
+def _finding(error: Exception, where: str) -> str:
+    """What a reader raised, as the message of a problem with ``where``.
+
+    Readers name what they know can be broken. Whatever else stops them must not cost the report of
+    all other frames.
+    """
+    if isinstance(error, CaperError):
+        return one_line(error)
+    return f"{where}: unreadable ({type(error).__name__}: {one_line(error)})"
