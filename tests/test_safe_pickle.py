@@ -1,6 +1,7 @@
 """Pickles of arrays are read; anything that could run code is refused by name."""
 
 import collections
+import itertools
 import os
 import pickle
 import struct
@@ -46,6 +47,17 @@ def test_arrays_and_plain_containers_of_every_protocol(tmp_path, protocol):
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps(CONTENT, protocol))
     assert_same(safe_pickle.load(path), CONTENT)
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_arrays_whose_axes_changed_places(tmp_path, protocol):
+    """Protocol 5 keeps the bytes as they lie and says how the axes go."""
+    whole = np.arange(120, dtype=np.int16).reshape(2, 3, 4, 5)
+    arrays = [whole.transpose(axes) for axes in itertools.permutations(range(4))]
+    arrays += [whole[:, ::2], whole.transpose(2, 0, 3, 1)[::2], whole[1].transpose(1, 0, 2)]
+    path = tmp_path / "a.pkl"
+    path.write_bytes(pickle.dumps(arrays, protocol))
+    assert_same(safe_pickle.load(path), arrays)
 
 
 def test_names_of_older_numpy(tmp_path):

@@ -165,14 +165,28 @@ class _ObjectArray(_Array):
         self.value = flat.reshape(shape, order="F" if by_column else "C")
 
 
-def _from_bytes(data: Any, dtype: Any, shape: Any, order: str) -> np.ndarray:
+def _from_bytes(
+    data: Any, dtype: Any, shape: Any, order: str, axis_order: Any = None
+) -> np.ndarray:
+    """An array from its bytes.
+
+    Args:
+      data: the bytes.
+      dtype: a ``_Dtype``.
+      shape: of the bytes.
+      order: "C", "F", or "K" for bytes in C order whose axes then change places.
+      axis_order: which axis of the bytes becomes which of the array; with "K" alone.
+    """
     if not isinstance(dtype, _Dtype):
         raise _ForbiddenError(f"an array of dtype {dtype!r}")
     if isinstance(data, str):  # bytes of Python 2
         data = data.encode("latin1")
     if not isinstance(data, (bytes, bytearray)):
         raise _ForbiddenError("an array of Python objects")
-    return np.frombuffer(data, dtype.real()).reshape(shape, order=order).copy()  # type: ignore[call-overload]
+    flat = np.frombuffer(data, dtype.real())
+    if order == "K" and axis_order is not None:
+        return flat.reshape(shape).transpose(axis_order).copy()
+    return flat.reshape(shape, order=order).copy()  # type: ignore[call-overload]
 
 
 def _reconstruct(kind: Any, shape: Any, code: Any) -> _Array:
