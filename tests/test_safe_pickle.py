@@ -113,6 +113,32 @@ def test_everything_else_is_refused_by_name(tmp_path, content, named):
     assert not trace.exists()
 
 
+def doubled(times):
+    """Lists that hold the last one twice."""
+    value = [1]
+    for _ in range(times):
+        value = [value, value]
+    return value
+
+
+def test_what_is_named_often_is_rebuilt_once(tmp_path):
+    path = tmp_path / "a.pkl"
+    path.write_bytes(pickle.dumps([doubled(18), {"a": np.eye(2)}]))
+    found, _ = safe_pickle.load(path)
+    for _ in range(18):
+        assert found[0] is found[1]
+        found = found[0]
+    assert found == [1]
+
+
+@pytest.mark.parametrize("last", [lambda v: v, lambda v: {"a": v}, lambda v: (v, np.eye(2))])
+def test_more_values_than_anybody_could_go_through_are_refused(tmp_path, last):
+    path = tmp_path / "bad.pkl"
+    path.write_bytes(pickle.dumps(last(doubled(24))))
+    with pytest.raises(CaperError, match=r"bad\.pkl: .*more than 10,000,000 values"):
+        safe_pickle.load(path)
+
+
 def test_layouts_of_memory_are_not_taken_on_trust(tmp_path):
     """An array of 'O' whose state is raw bytes would make numpy follow forged pointers."""
     dtype = b"cnumpy\ndtype\nX\x01\x00\x00\x00O\x85R"

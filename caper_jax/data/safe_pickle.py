@@ -22,6 +22,7 @@ from caper_jax.errors import CaperError
 
 _NUMBERS = "biufc"
 _TEXTS = "SU"
+_MOST_VALUES = 10_000_000
 
 
 def load(path: str | Path) -> Any:
@@ -87,7 +88,7 @@ def load_npz(path: str | Path, key: str) -> Any:
 
 def _read(file: IO[bytes], unpickler: type[_Unpickler], where: str) -> Any:
     try:
-        return _plain(unpickler(file, encoding="latin1").load())
+        return _plain(unpickler(file, encoding="latin1").load(), {})[0]
     except _ForbiddenError as error:
         raise CaperError(
             f"{where}: the pickle asks for {error}, but only numpy arrays and plain containers "
@@ -229,17 +230,41 @@ _KNOWN: dict[tuple[str, str], Any] = {
 }
 
 
-def _plain(value: Any) -> Any:
-    """The value with its arrays in place of what stood for them."""
+# What was rebuilt, by the identity of the value: the value itself (kept, or another could get its
+# identity), what came of it, and how many values that holds.
+_Done = dict[int, tuple[Any, Any, int]]
+
+
+def _plain(value: Any, done: _Done) -> tuple[Any, int]:
+    """The value with its arrays in place of what stood for them, and how many values it holds.
+
+    A value that a pickle names often is rebuilt once: 20 lists that each hold the last one twice
+    are 134 bytes and a million values.
+    """
+    if not isinstance(value, (_Array, dict, list, tuple, set, frozenset)):
+        if isinstance(value, (_Dtype, type)) or callable(value):
+            raise _ForbiddenError(f"a bare {getattr(value, '__name__', type(value).__name__)}")
+        return value, 1
+    if id(value) not in done:
+        done[id(value)] = value, *_rebuilt(value, done)
+    _, plain, count = done[id(value)]
+    if count > _MOST_VALUES:  # whoever goes through them would not come to an end
+        raise _ForbiddenError(f"more than {_MOST_VALUES:,} values")
+    return plain, count
+
+
+def _rebuilt(value: Any, done: _Done) -> tuple[Any, int]:
+    """A container or an array, see ``_plain``."""
     if isinstance(value, _Array):
+        count = 1
         if value.value.dtype == object:
             for index in np.ndindex(value.value.shape):
-                value.value[index] = _plain(value.value[index])
-        return value.value
+                value.value[index], more = _plain(value.value[index], done)
+                count += more
+        return value.value, count
     if isinstance(value, dict):
-        return {_plain(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return type(value)(_plain(item) for item in value)
-    if isinstance(value, (_Dtype, type)) or callable(value):
-        raise _ForbiddenError(f"a bare {getattr(value, '__name__', type(value).__name__)}")
-    return value
+        pairs = [(_plain(key, done), _plain(item, done)) for key, item in value.items()]
+        count = 1 + sum(key[1] + item[1] for key, item in pairs)
+        return {key[0]: item[0] for key, item in pairs}, count
+    items = [_plain(item, done) for item in value]
+    return type(value)(item for item, _ in items), 1 + sum(count for _, count in items)
