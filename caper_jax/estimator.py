@@ -81,8 +81,15 @@ def estimate(
 
     Returns:
       Prediction with leading axis B and M = N.
-    """
 
+    Raises:
+      CaperError: points of another shape, or no floats.
+    """
+    if jnp.ndim(points) != 3 or jnp.shape(points)[-1] != 3:
+        raise CaperError(f"points must be [B, N, 3], got {jnp.shape(points)}")
+    points = jnp.asarray(points)
+    if not jnp.issubdtype(points.dtype, jnp.floating):
+        raise CaperError(f"points must be floats, in metres, got {points.dtype}")
     view = view_rotation(points)
     cloud = rotate(view, points) * category.unit
     found = read(variables, cloud, category, network)
@@ -143,8 +150,9 @@ class Estimator:
         """Estimates one cloud or a batch.
 
         Outside of transformations any number of points is taken: clouds are sampled to what the
-        networks see, so that a varying number never recompiles, and points that are NaN, infinite
-        or exactly zero are left out. Inside jit, grad or vmap the array goes through unchanged.
+        networks see, so that a varying number never recompiles, and points that are NaN, infinite,
+        exactly zero or beyond 50 m are left out. Inside jit, grad or vmap the array goes through
+        unchanged.
 
         Args:
           points: [N, 3] or [B, N, 3] metres, camera frame (OpenCV), in any order.

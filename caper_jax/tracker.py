@@ -11,12 +11,14 @@ import jax
 import numpy as np
 
 from caper_jax.configuration import from_dict, override
-from caper_jax.data.cloud import MIN_POINTS, is_measured, sample_points
+from caper_jax.data.cloud import FARTHEST_M, MIN_POINTS, as_cloud, is_measured, sample_points
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load
 from caper_jax.tracking.config import TrackerConfig
 from caper_jax.tracking.state import Observation, TrackerState
 from caper_jax.tracking.step import Tracked, given_state, initial_state, track_step
+
+_RIGID = 1e-2  # how far R R^T of a given pose may be from the identity
 
 
 class Tracker:
@@ -68,10 +70,13 @@ class Tracker:
           labels: [N] int, parts of the points, where they are known.
 
         Raises:
-          CaperError: too few usable points, or poses of other shapes.
+          CaperError: too few usable points, no points beside a pose, or poses of other shapes or
+            that are no rigid motions in metres. The track goes on as it was.
         """
-        self.state = self.initial_state()
         if points is None:
+            if rotation is not None or translation is not None:
+                raise CaperError("a first pose needs the points of its frame")
+            self.state = self.initial_state()
             return
         frame = self.observe(points, labels)
         if not frame.present:
@@ -80,14 +85,23 @@ class Tracker:
                 "needed"
             )
         parts = self.estimator.category.num_parts
-        rotation, translation = (
-            np.asarray(rotation, np.float32),
-            np.asarray(translation, np.float32),
-        )
+        try:
+            rotation = np.asarray(rotation, np.float32)
+            translation = np.asarray(translation, np.float32)
+        except (TypeError, ValueError) as error:
+            raise CaperError(f"the first pose must be numbers ({error})") from error
         if rotation.shape != (parts, 3, 3) or translation.shape != (parts, 3):
             raise CaperError(
                 f"the first pose must be rotation [{parts}, 3, 3] and translation [{parts}, 3], "
                 f"got {list(rotation.shape)} and {list(translation.shape)}"
+            )
+        off = np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)).max()
+        if not (off < _RIGID and (np.linalg.det(rotation) > 0).all()):  # NaN is not less
+            raise CaperError("the first pose's rotation must hold rotation matrices")
+        if not (np.abs(translation) <= FARTHEST_M).all():
+            raise CaperError(
+                f"the first pose's translation must be metres, at most {FARTHEST_M:g}, "
+                f"got {np.abs(translation).max():.4g}"
             )
         self.state = self._given(self.estimator.variables, frame, rotation, translation)
 
@@ -95,17 +109,19 @@ class Tracker:
         """A frame of any number of points as the step takes it.
 
         Args:
-          points: [N, 3] metres, camera frame, N may be 0; NaN, infinite and zero points are left
-            out. Fewer than 16 usable points count as a frame that does not show the object.
+          points: [N, 3] metres, camera frame, N may be 0; NaN, infinite and zero points and those
+            beyond 50 m are left out. Fewer than 16 usable points count as a frame that does not
+            show the object.
           labels: [N] int parts, -1 where unknown; by default all are predicted.
 
         Raises:
-          CaperError: wrong shape or dtype, or points in millimetres.
+          CaperError: wrong shape or dtype, points in millimetres or behind the camera, or labels
+            that are no parts.
         """
         count = self.estimator.network.num_points
-        points = np.asarray(points)
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise CaperError(f"points must be [N, 3], got shape {points.shape}")
+        points = as_cloud(points)
+        if labels is not None:
+            labels = self._checked_labels(labels, len(points))
         unknown = np.full(count, -1, np.int32)
         if is_measured(points).sum() < MIN_POINTS:
             nothing = np.zeros((count, 3), np.float32)
@@ -113,10 +129,16 @@ class Tracker:
         cloud = sample_points(points, count)
         if labels is None:
             return Observation(cloud.points, np.asarray(True), unknown)
-        labels = np.asarray(labels, np.int32)
-        if labels.shape != (len(points),):
-            raise CaperError(f"labels must be [{len(points)}] like points, got {labels.shape}")
         return Observation(cloud.points, np.asarray(True), labels[cloud.index])
+
+    def _checked_labels(self, labels, count: int) -> np.ndarray:
+        labels = np.asarray(labels)
+        if labels.shape != (count,):
+            raise CaperError(f"labels must be [{count}] like points, got {labels.shape}")
+        parts = self.estimator.category.num_parts
+        if labels.dtype.kind not in "iu" or not ((labels >= -1) & (labels < parts)).all():
+            raise CaperError(f"labels must be integers from -1 to {parts - 1}")
+        return labels.astype(np.int32)
 
     def __call__(self, points, labels=None) -> Tracked:
         """Tracks through the next frame; see ``observe`` for the arguments."""

@@ -39,6 +39,16 @@ def test_points_project_onto_their_pixels():
     assert (cloud.available, cloud.dropped) == (70 * 90, 0)
 
 
+def test_huge_and_far_points_are_dropped_and_counted():
+    """Some cameras say "nothing" by the largest number there is."""
+    near = np.random.default_rng(0).normal([0, 0, 1], 0.1, (64, 3))
+    for value in (3.4e38, 1e300, 1e10, -1e5, 60.0):
+        points = np.vstack([near, [[0.0, value, 1.0]]])
+        cloud = sample_points(points, 65)
+        assert cloud.dropped == 1 and np.abs(cloud.points).max() < 2
+        assert not are_sampled(points[None], 65)
+
+
 def test_pixels_without_depth_are_dropped_and_counted():
     depth, mask = slope(), np.ones(SHAPE, bool)
     depth[:, :10], depth[:, 10:15], depth[:, 15:17], depth[:, 17] = 0, np.nan, np.inf, -1

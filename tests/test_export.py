@@ -168,6 +168,15 @@ def test_the_runner_is_short_and_refuses_clouds_of_few_points(drawer):
         runner["sample"](clouds(1)[0, :15])
 
 
+def test_the_runner_picks_the_points_that_the_package_picks(drawer):
+    _, folder = drawer
+    runner = runpy.run_path(str(folder / "run.py"))
+    rng = np.random.default_rng(0)
+    dense = rng.normal([0.0, 0.1, 1.0], [0.3, 0.2, 0.1], (20_000, 3)).astype(np.float32)
+    picked = runner["sample"](dense)
+    np.testing.assert_array_equal(picked, sample_points(dense, len(picked)).points)
+
+
 def test_the_command_exports_a_model_of_ones_own(drawer, tmp_path, capsys):
     estimator, folder = drawer
     write_model(tmp_path / "model", estimator.variables, estimator.card)

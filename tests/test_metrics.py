@@ -218,8 +218,14 @@ def test_a_second_reading_is_the_same_object(category, pose, equivalence):
     assert distance.min(-1).max() < 1e-6 and distance.min(-2).max() < 1e-6
 
 
+def alike(size):
+    """Extents [F, 3] of the box's other part with which both may change places."""
+    return size @ np.abs(np.array(BOX.equivalences[0].turn))
+
+
 def test_errors_up_to_symmetry_take_the_better_reading_of_each_frame():
     truth = random_pose(FRAMES)
+    truth.size[:, 1] = alike(truth.size[:, 0])
     other = second_reading(truth, BOX.equivalences[0], BOX)
     swapped = np.arange(FRAMES) % 3 == 0
     guess = mixed(swapped, other, truth)
@@ -232,6 +238,17 @@ def test_errors_up_to_symmetry_take_the_better_reading_of_each_frame():
         np.testing.assert_allclose(getattr(symmetric, key), 0, atol=1e-5)
     assert (plain.rotation_deg[swapped, 0] > 5).all()
     np.testing.assert_array_equal(plain.rotation_deg[~swapped], symmetric.rotation_deg[~swapped])
+
+
+def test_parts_that_are_not_alike_may_not_change_places():
+    (equivalence,) = BOX.equivalences
+    pose = random_pose(40)
+    pose.size[:, 1] = alike(pose.size[:, 0])
+    pose.size[20:, 1] *= 2
+    guess = second_reading(pose, equivalence, BOX)
+    plain, symmetric = (f(guess, pose, BOX) for f in (pose_errors, pose_errors_up_to_symmetry))
+    assert symmetric.rotation_deg[:20].max() < 1e-3
+    np.testing.assert_array_equal(symmetric.rotation_deg[20:], plain.rotation_deg[20:])
 
 
 def test_impossible_symmetries_and_shapes_are_named():

@@ -252,6 +252,17 @@ def test_local_moments_are_weighted_means_and_covariances():
     np.testing.assert_allclose(scaled, result, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("count", [90, 100, 127, 128])
+def test_centres_are_spread_over_every_cloud(count):
+    """On a line no centre is nearest to more than its share of the points."""
+    config = FastEncoderConfig(centers_in_use=64, scales=(0.002,), width=4, blocks=1, last=4)
+    module = FastEncoder(config)
+    points = jnp.arange(count * 1.0)[None, :, None] * jnp.array([1.0, 0.0, 0.0])
+    output = module.apply(variables_of(module, points), points, train=False)
+    shares = np.bincount(np.asarray(output.levels[0].upsample)[0].argmax(-1), minlength=64)
+    assert shares.min() >= 1 and shares.max() <= 2
+
+
 def test_fast_encoder_interpolates_its_centres():
     config = FastEncoderConfig(
         centers=8, centers_in_use=16, scales=(0.1,), width=4, blocks=1, last=4

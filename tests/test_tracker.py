@@ -121,6 +121,19 @@ class TestShipped:
         again, errors = player.show(0, 9)
         assert not again.lost and errors.max() < 5
 
+    def test_numbers_that_overflow_are_not_remembered(self, player):
+        player.begin(0)
+        before, _ = player.show(0, 1)
+        state = player.tracker.state
+        frame = player.tracker.observe(player.videos.points[0, 2])
+        frame = replace(frame, points=frame.points * np.float32(1e30))
+        variables = player.tracker.estimator.variables
+        player.tracker.state, held = player.tracker.step(variables, state, frame)
+        assert held.lost and not held.keyframe
+        jax.tree.map(np.testing.assert_array_equal, held.pose, before.pose)
+        again, errors = player.show(0, 3)
+        assert not again.lost and errors.max() < 5
+
     def test_a_wrong_first_pose_is_noticed_and_put_right(self, player):
         turn = Rotation.from_euler("y", 60, degrees=True).as_matrix()
         right = []
@@ -148,6 +161,32 @@ class TestShipped:
             errors, _ = player.play(video, range(3, 12))
             right.append(errors[-1].max() < 15)
         assert most(right)
+
+    def test_a_start_that_is_off_by_a_turn_is_outvoted(self, tracker, videos):
+        """By estimates of the next frames, and only while it is on trial."""
+        settings = replace(tracker.config, policy="promote", patience=1000, turned=1.5)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(jax, "jit", quick_jit)
+            player = Player(Tracker(tracker.estimator, settings), videos)
+        half = np.diag([-1.0, 1.0, -1.0])
+        right = []
+        for video in range(VIDEOS):
+            player.begin(video, half)
+            # Stage II is kept from speaking.
+            silent = replace(player.tracker.state, vote=np.zeros(24, np.float32))
+            player.tracker.state = silent
+            errors, _ = player.play(video, range(1, 4))
+            assert errors.min() > 150
+            player.tracker.state = replace(silent, trial=np.int32(5))
+            errors, _ = player.play(video, range(1, 5))
+            right.append(errors[-1].max() < 15)
+            assert player.tracker.state.trial > 0
+        assert most(right)
+
+    def test_a_start_from_the_estimator_is_on_trial(self, player):
+        player.tracker.reset()
+        asked = [bool(player.show(0, frame)[0].estimated) for frame in range(7)]
+        assert asked[:6] == [True] * 6 and player.tracker.state.trial == 0
 
     def test_a_jump_to_another_object_is_noticed(self, player):
         right = []
@@ -301,8 +340,10 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("points", "message"),
         [
-            (np.zeros((64, 4)), r"points must be \[N, 3\], got shape \(64, 4\)"),
-            (np.zeros((1, 64, 3)), r"points must be \[N, 3\], got shape \(1, 64, 3\)"),
+            (np.zeros((64, 4)), r"a cloud must be \[N, 3\], got \(64, 4\)"),
+            (np.zeros((1, 64, 3)), r"a cloud must be \[N, 3\], got \(1, 64, 3\)"),
+            ([["a"] * 3] * 20, "must be numbers in metres"),
+            ([[1, 2, 3], [1, 2]], "points is no array"),
             (POINTS * 1000, "millimetres"),
             (POINTS * [1, -1, -1], "behind the camera"),
         ],
@@ -314,6 +355,34 @@ class TestMistakes:
     def test_labels_of_another_length(self):
         with pytest.raises(CaperError, match=r"labels must be \[64\] like points, got \(63,\)"):
             toy()(self.POINTS, np.zeros(63, int))
+
+    @pytest.mark.parametrize("labels", [np.full(64, 2), np.full(64, -2), np.full(64, 0.7)])
+    def test_labels_that_are_no_parts(self, labels):
+        with pytest.raises(CaperError, match="labels must be integers from -1 to 1"):
+            toy()(self.POINTS, labels)
+
+    @pytest.mark.parametrize(
+        ("factor", "shift", "message"),
+        [
+            (2.0, 0.8, "must hold rotation matrices"),
+            (np.diag([1.0, 1.0, -1.0]), 0.8, "must hold rotation matrices"),
+            (np.nan, 0.8, "must hold rotation matrices"),
+            (1.0, np.nan, "must be metres"),
+            (1.0, 800.0, "must be metres, at most 50, got 800"),
+            ("x", 0.8, "must be numbers"),
+        ],
+    )
+    def test_first_poses_that_are_no_motions_leave_the_track_as_it_was(
+        self, factor, shift, message
+    ):
+        tracker = toy()
+        before = tracker.state
+        rotation = "x" if isinstance(factor, str) else np.tile(np.eye(3), (2, 1, 1)) * factor
+        with pytest.raises(CaperError, match=message):
+            tracker.reset(self.POINTS, rotation, np.full((2, 3), shift))
+        with pytest.raises(CaperError, match="needs the points of its frame"):
+            tracker.reset(rotation=rotation)
+        assert tracker.state is before
 
     @pytest.mark.parametrize(
         ("rotation", "translation"), [((3, 3), (2, 3)), ((2, 3, 3), (3,)), ((3, 3, 3), (3, 3))]

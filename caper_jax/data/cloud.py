@@ -15,7 +15,8 @@ MIN_POINTS = 16
 # Lines per side over the object's box: the generator casts its rays on such a grid.
 GRID = 96
 # Beyond this depth (metres) a cloud is taken for one in millimetres.
-_FARTHEST_M = 50.0
+FARTHEST_M = 50.0
+_ABSURD = 1e6  # no coordinate in any unit: some cameras say "nothing" by the largest float
 
 
 @dataclass(frozen=True)
@@ -156,8 +157,29 @@ def back_project(
 
 
 def is_measured(points: np.ndarray) -> np.ndarray:
-    """Which points [..., 3] are any: NaN, infinity and zero stand for no measurement."""
-    return np.isfinite(points).all(-1) & (points != 0).any(-1)
+    """Which points [..., 3] are any: NaN, infinity, zero and huge numbers stand for none."""
+    # Comparisons with NaN are false.
+    return (np.abs(points) < _ABSURD).all(-1) & (points != 0).any(-1)
+
+
+def as_cloud(points, where: str = "points") -> np.ndarray:
+    """Points as [N, 3] float32; N may be 0.
+
+    Raises:
+      CaperError: another shape, or not numbers.
+    """
+    try:
+        points = np.asarray(points)
+    except ValueError as error:
+        raise CaperError(f"{where} is no array ({error})") from error
+    if points.shape == (0,):
+        points = points.reshape(0, 3)
+    if points.ndim != 2 or points.shape[-1] != 3:
+        raise CaperError(f"{where}: a cloud must be [N, 3], got {points.shape}")
+    if points.dtype.kind not in "fiu":
+        raise CaperError(f"{where}: a cloud must be numbers in metres, got {points.dtype}")
+    with np.errstate(over="ignore"):
+        return points.astype(np.float32)
 
 
 def sample_points(
@@ -170,8 +192,8 @@ def sample_points(
     """Picks ``num_points`` of a raw cloud in any order, evenly over the image.
 
     Args:
-      points: [N, 3] metres, camera frame; rows with NaN or infinity, and rows of zeros (no
-        measurement in an organised cloud) are dropped and counted.
+      points: [N, 3] metres, camera frame; rows with NaN or infinity, rows of zeros (no
+        measurement in an organised cloud) and points beyond 50 m are dropped and counted.
       num_points: points to return; smaller clouds are repeated evenly.
       seed: see ``systematic_indices``.
       radius: see ``cloud_from_depth``.
@@ -184,16 +206,11 @@ def sample_points(
       CaperError: wrong shape or dtype, millimetres, points behind the camera, or fewer than 16
         usable points.
     """
-    points = np.asarray(points)
-    if points.ndim != 2 or points.shape[-1] != 3:
-        raise CaperError(f"{where}: a cloud must be [N, 3], got {points.shape}")
-    if points.dtype.kind not in "fiu":
-        raise CaperError(f"{where}: a cloud must be numbers in metres, got {points.dtype}")
-    cast = points.astype(np.float32)
+    cast = as_cloud(points, where)
     kept = np.flatnonzero(is_measured(cast))
     _check_count(len(kept), f"of {len(points)} points in {where}")
     median_depth = float(np.median(cast[kept, 2]))
-    if abs(median_depth) > _FARTHEST_M:
+    if abs(median_depth) > FARTHEST_M:
         raise CaperError(
             f"{where}: median depth {median_depth:.4g} m; these seem to be millimetres: "
             "multiply by 0.001"
@@ -203,6 +220,8 @@ def sample_points(
             f"{where}: median depth {median_depth:.4g} m lies behind the camera; the camera looks "
             "along +z (OpenCV): from an OpenGL frame negate y and z"
         )
+    kept = kept[(np.abs(cast[kept]) <= FARTHEST_M).all(-1)]
+    _check_count(len(kept), f"of {len(points)} points in {where}")
     if radius is not None:
         kept = kept[_near(cast[kept], radius)]
         _check_count(len(kept), f"of {len(points)} points in {where}")
@@ -223,11 +242,12 @@ def are_sampled(clouds: np.ndarray, num_points: int) -> bool:
     """
     if clouds.shape[1] != num_points or clouds.dtype.kind not in "fiu":
         return False
-    cast = clouds.astype(np.float32)
+    with np.errstate(over="ignore"):
+        cast = clouds.astype(np.float32)
     if not is_measured(cast).all():
         return False
     depth = np.median(cast[..., 2], axis=1)
-    return bool(((depth > 0) & (depth <= _FARTHEST_M)).all())
+    return bool((depth > 0).all() and (np.abs(cast) <= FARTHEST_M).all())
 
 
 def _near(points: np.ndarray, radius: float) -> np.ndarray:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from caper_jax.articulation.category import Category
-from caper_jax.articulation.equivalence import second_reading
+from caper_jax.articulation.equivalence import is_ambiguous, second_reading
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.schema import pose_shapes
 from caper_jax.errors import CaperError
@@ -111,13 +111,18 @@ def pose_errors_up_to_symmetry(
     """Errors against the better of the category's declared readings of the truth.
 
     Better is the reading, frame by frame, whose root is turned less from the estimate's; all
-    errors of the frame are those against that reading.
+    errors of the frame are those against that reading. An instance whose exchanged parts are not
+    alike (``Equivalence.tolerance``) has one reading.
 
     Args and errors as for ``pose_errors``.
     """
     readings = [truth, *(second_reading(truth, e, category) for e in category.equivalences)]
     scores = [pose_errors(estimate, reading, category, failed) for reading in readings]
-    best = np.argmin([score.rotation_deg[:, 0] for score in scores], axis=0)
+    turns = [score.rotation_deg[:, 0] for score in scores]
+    for number, equivalence in enumerate(category.equivalences, start=1):
+        alike = np.asarray(is_ambiguous(np.asarray(truth.size), equivalence))
+        turns[number] = np.where(alike, turns[number], np.inf)
+    best = np.argmin(turns, axis=0)
     frames = np.arange(len(best))
     return PoseErrors(
         **{

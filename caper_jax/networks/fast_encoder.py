@@ -25,7 +25,7 @@ class FastEncoderConfig:
     """Sizes of the fast encoder.
 
     Attributes:
-      centers: points that get local moments in training; every (N / centers)-th of the cloud.
+      centers: points that get local moments in training; evenly over the cloud.
       centers_in_use: the same when a trained model is used: with more of them the same weights
         are more accurate.
       stride: the moments are taken over every stride-th point.
@@ -98,7 +98,9 @@ class FastEncoder(nn.Module):
             return nn.relu(BatchNorm(use_running_average=not train, momentum=0.9)(features))
 
         count = config.centers if train else config.centers_in_use
-        centers = points[:, :: max(1, points.shape[1] // count)][:, :count]
+        total = points.shape[1]
+        count = min(count, total)
+        centers = points[:, jnp.arange(count) * total // count]
         middle = points.mean(axis=1, keepdims=True)
         radius = jnp.sqrt(((points - middle) ** 2).sum(-1).mean(-1) + 1e-8)
         window = points[:, :: config.stride]

@@ -43,8 +43,8 @@ class TrackerConfig:
         correct or replace a track: from a closed drawer's back any side may be the front.
       trial: frames after a start from the static estimator in which it is asked again, as long as
         it is sure: its poses are averaged, and vote on turns.
-      vote: nats by which a static estimate that is a quarter or half turn from the track speaks for
-        that turn, and one that is not speaks against.
+      vote: nats by which such an estimate, a quarter or half turn from the track, speaks for that
+        turn, and one that is not speaks against.
       turned: sum over frames of the log odds that the track is off by a quarter or half turn, at
         which that turn is made: of stage II's, at most 1 nat per frame, for networks with a turn
         head; or of the votes.

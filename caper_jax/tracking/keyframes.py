@@ -110,7 +110,9 @@ def corrected(
         lambda: tracked,
     )
     sure = asked & ((static.sure >= config.sure) | (doubtful >= config.patience + _LONG))
-    vote = jnp.where(sure, turn_votes(state.vote, tracked.root, static.root, config), state.vote)
+    # Later the track has seen more than a single frame shows.
+    votes = turn_votes(state.vote, tracked.root, static.root, config)
+    vote = jnp.where(sure & (state.trial > 0), votes, state.vote)
     outvoted = (vote.max() > config.turned) & ~state.lost & (turned == 0)
     turned = jnp.where(outvoted, vote.argmax().astype(jnp.int32), turned)
     reference = turned_pose(tracked.root, jnp.asarray(TURNS, tracked.root.dtype)[turned])

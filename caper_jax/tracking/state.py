@@ -84,7 +84,7 @@ class TrackerState:
       doubtful: [] int32, frames in a row that disagreed with the track.
       turn: [24] log odds, over the frames so far, that the track is off by a turn, as stage II sees
         it.
-      vote: [24] likewise, by static estimates.
+      vote: [24] likewise, by static estimates on trial.
       trial: [] int32, in so many further frames the static estimator is asked.
       lost: [] bool, the next frame with points starts afresh from the static estimator.
     """

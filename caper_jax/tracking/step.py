@@ -53,13 +53,13 @@ class Tracked:
     """What the tracker says about one frame.
 
     Attributes:
-      pose: ArticulatedPose [K, ...], metres, camera frame; the last one where ``lost``.
+      pose: ArticulatedPose [K, ...], metres, camera frame.
       labels: [N] int32 part of each point.
       energy: [] Eq 16, relative to the object's diagonal.
       keyframe: [] bool, whether this frame became the keyframe.
       estimated: [] bool, whether the static estimator was asked.
       lost: [] bool, the pose is not to be trusted: held from before, as the frame does not show the
-        object, or contradicted by what it does show.
+        object or holds impossible numbers, or this frame's, contradicted by what it does show.
     """
 
     pose: ArticulatedPose
@@ -293,15 +293,22 @@ def _track_step(
         root_velocity=jnp.zeros_like(state.root_velocity),
         joint_velocity=jnp.zeros_like(state.joint_velocity),
     )
-    after = select(frame.present, after, held)
+    # Numbers that overflowed on the way would stay for good.
+    usable = frame.present & _finite(after)
+    after = select(usable, after, held)
     return after, Tracked(
         pose=_articulated_pose(after, category),
         labels=fix.labels,
         energy=energy,
-        keyframe=due & frame.present,
-        estimated=correction.asked & frame.present,
-        lost=~frame.present | (contradicted & ~replaced),
+        keyframe=due & usable,
+        estimated=correction.asked & usable,
+        lost=~usable | (contradicted & ~replaced),
     )
+
+
+def _finite(tree):
+    """[] bool, whether every number of a pytree is."""
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()
 
 
 def _expectations(config: RegistrationConfig, predicted, found):

@@ -25,8 +25,8 @@ def sample(points):  # without what is no measurement, as many points as the mod
     assert len(points) >= 16, f"only {len(points)} usable points"
     if len(points) > SHAPE[1]:  # into rows of the image, to and fro
         x, y = (points[:, :2] / np.maximum(points[:, 2:], max(points[:, 2].mean() / 2, 1e-6))).T
-        row = np.floor((y - y.mean()) / max(y.std(), 1e-9) * 32 * 12**-0.5)
-        points = points[np.lexsort((np.where(row % 2 == 1, -x, x), row))]
+        x, y = ((w - w.mean()) / max(w.std(), 1e-9) * f for w, f in ((x, 8192), (y, 32 * 12**-0.5)))
+        points = points[np.lexsort((y % 1 * 8 // 1, np.where(y % 2 < 1, x, -x) // 1, y // 1))]
     return points[((np.arange(SHAPE[1]) + 0.5) * len(points) / SHAPE[1]).astype(int)]
 
 
