@@ -139,6 +139,27 @@ def test_more_values_than_anybody_could_go_through_are_refused(tmp_path, last):
         safe_pickle.load(path)
 
 
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        (b"_codecs\nencode", (None, {"__defaults__": ("utf-8",)})),
+        (b"_codecs\nencode", {"note": 1}),
+        (b"numpy._core.multiarray\nscalar", (None, {"__defaults__": ()})),
+        (b"numpy\ndtype", (None, {"real": 1})),
+        (b"collections\nOrderedDict", (None, {"copy": 1})),
+    ],
+)
+def test_nothing_that_is_called_can_be_changed(tmp_path, name, change):
+    """BUILD sets attributes of whatever lies before it, here of what stands for a function."""
+    path = tmp_path / "bad.pkl"
+    state = pickle.dumps(change, 2)[2:-1]
+    path.write_bytes(b"\x80\x02c" + name + b"\n" + state + b"b0N.")
+    with pytest.raises(CaperError, match=r"bad\.pkl: "):
+        safe_pickle.load(path)
+    path.write_bytes(pickle.dumps(CONTENT, 2))
+    assert_same(safe_pickle.load(path), CONTENT)
+
+
 def test_layouts_of_memory_are_not_taken_on_trust(tmp_path):
     """An array of 'O' whose state is raw bytes would make numpy follow forged pointers."""
     dtype = b"cnumpy\ndtype\nX\x01\x00\x00\x00O\x85R"

@@ -13,6 +13,7 @@ import io
 import pickle
 import zipfile
 from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -209,13 +210,36 @@ def _empty() -> bytes:
     return b""
 
 
+class _Function:
+    """Calls a function of this module, and lets a pickle set nothing in it.
+
+    Functions have attributes, ``__defaults__`` among them, that a pickle could change for all files
+    that are read later.
+    """
+
+    __slots__ = ("_function",)
+    _function: Callable[..., Any]
+
+    def __init__(self, function: Callable[..., Any]):
+        object.__setattr__(self, "_function", function)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._function(*arguments)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise _ForbiddenError(f"a change of {self._function.__name__}")
+
+    def __setstate__(self, state: Any) -> None:
+        raise _ForbiddenError(f"a change of {self._function.__name__}")
+
+
 _KNOWN: dict[tuple[str, str], Any] = {
     ("numpy", "dtype"): _Dtype,
     ("numpy", "ndarray"): _Array,
-    ("numpy._core.multiarray", "_reconstruct"): _reconstruct,
-    ("numpy._core.multiarray", "scalar"): _scalar,
-    ("numpy._core.numeric", "_frombuffer"): _from_bytes,
-    ("_codecs", "encode"): _encode,
+    ("numpy._core.multiarray", "_reconstruct"): _Function(_reconstruct),
+    ("numpy._core.multiarray", "scalar"): _Function(_scalar),
+    ("numpy._core.numeric", "_frombuffer"): _Function(_from_bytes),
+    ("_codecs", "encode"): _Function(_encode),
     ("collections", "OrderedDict"): OrderedDict,
     **{
         (module, name): kind
@@ -224,7 +248,7 @@ _KNOWN: dict[tuple[str, str], Any] = {
             ("set", set),
             ("frozenset", frozenset),
             ("complex", complex),
-            ("bytes", _empty),
+            ("bytes", _Function(_empty)),
         )
     },
 }
