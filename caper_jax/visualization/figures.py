@@ -27,9 +27,9 @@ def save_figure(figure: Figure, path: str | Path, **options: Any) -> Path:
     try:
         figure.savefig(buffer, format=path.suffix[1:] or "png", **options)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, buffer.getvalue())
     except ValueError as error:
         raise CaperError(f"cannot write {path}: {error}") from error
     except OSError as error:
         raise CaperError(f"cannot write {path}: {error.strerror or error}") from error
+    write_atomically(path, buffer.getvalue())
     return path
