@@ -215,6 +215,16 @@ def test_mistakes_in_the_arguments_are_code_2(tmp_path, capsys, options, message
     assert message in captured.err and captured.out == ""
 
 
+def test_the_report_does_not_replace_the_data(tmp_path, capsys):
+    path = roots.caper(tmp_path / "box.h5")
+    (tmp_path / "link.json").symlink_to(path)
+    whole = path.read_bytes()
+    for report in (path, tmp_path / "link.json"):
+        assert run("caper", path, "--json", str(report)) == 2
+        assert "is the data; give the report another name" in capsys.readouterr().err
+    assert path.read_bytes() == whole
+
+
 def test_at_most_twenty_problems_on_the_terminal():
     problems = [Problem(f"{i:06d}: size: must be positive", f"{i:06d}", "size") for i in range(33)]
     report = CategoryReport("box", {"train": 33}, 33, 2, 0, 33, problems)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from caper_jax.cli import common
 from caper_jax.data import FORMATS
 from caper_jax.errors import CaperError
+from caper_jax.files import write_atomically
 
 if TYPE_CHECKING:
     from caper_jax.data.validation import CategoryReport, Problem
@@ -51,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     if arguments.json is not None:
         common.check_folder(arguments.json.parent, "--json")
+        if arguments.json.resolve() == arguments.data.resolve():
+            raise CaperError(f"--json {arguments.json}: is the data; give the report another name")
     try:
         chosen = _categories(arguments)
         _check_split(arguments, chosen)
@@ -75,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "categories": [dataclasses.asdict(report) for report in reports],
         }
         arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_atomically(arguments.json, (json.dumps(content, indent=2) + "\n").encode())
     return EXIT_PROBLEMS if any(report.problems for report in reports) else 0
 
 
