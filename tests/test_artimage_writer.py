@@ -190,6 +190,17 @@ def test_a_root_has_one_camera_and_every_object_once(tmp_path):
     }
 
 
+def test_objects_of_a_run_that_was_cut_off_are_not_mixed_in(tmp_path):
+    category = categories.get("box")
+    first, second = draw_models(category, 2, "train", 0)
+    LayoutWriter(tmp_path, category, "train", CAMERA, (SIZE, SIZE)).add_object(7, first)
+    points = next(tmp_path.glob("box/urdf/7/*/0.xyz")).read_bytes()
+    writer = LayoutWriter(tmp_path, category, "train", CAMERA, (SIZE, SIZE))
+    with pytest.raises(CaperError, match=r"holds an object 7 already; choose .* or delete"):
+        writer.add_object(7, second)
+    assert next(tmp_path.glob("box/urdf/7/*/0.xyz")).read_bytes() == points
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_surface_points_reach_the_bounds_and_lie_within(name):
     for model in draw_models(categories.get(name), 5, "train", 1):

@@ -94,11 +94,18 @@ class LayoutWriter:
         Args:
           urdf_id: its number, new in this root.
           model: at rest, origin at the centre of its box.
+
+        Raises:
+          CaperError: the root holds an object of this number, maybe of a run that was cut off.
         """
-        if str(urdf_id) in self._states:
-            raise CaperError(f"{self.home}/urdf: holds an object {urdf_id} already")
         home = self.home / "urdf" / str(urdf_id)
-        (home / POINTS).mkdir(parents=True, exist_ok=True)
+        # Of a run that was cut off, folders are there and rest states are not.
+        if str(urdf_id) in self._states or home.exists():
+            raise CaperError(
+                f"{self.home}/urdf: holds an object {urdf_id} already; choose another folder, or, "
+                f"after a run that was cut off, delete {self.home} and write all its splits again"
+            )
+        (home / POINTS).mkdir(parents=True)
         rng = np.random.default_rng(urdf_id)
         for k, solids in enumerate(model.parts):
             points = surface_points(solids, _POINTS_PER_PART, rng)
