@@ -141,6 +141,15 @@ def test_the_joint_that_is_most_open_counts():
         np.testing.assert_allclose(means, rows.mean(0))
 
 
+def test_glasses_open_as_their_states_fall_and_arms_not_at_all():
+    glasses = categories.get("eyeglasses")
+    errors = PoseErrors(**{f.name: np.zeros((1, 3)) for f in dataclasses.fields(PoseErrors)})
+    folded = np.array([[joint.limits[1] for joint in glasses.joints]])
+    bins = by_opening(errors, folded, glasses)
+    assert [content["parts"][0]["frames"] for content in bins] == [1, 0, 0]
+    assert categories.get("robotarm").closed is None
+
+
 def test_every_figure_can_be_computed_from_the_predictions(path, tmp_path, estimator):
     """SciPy and NumPy on predictions.npz and the dataset alone."""
     assert run(path, tmp_path) == 0

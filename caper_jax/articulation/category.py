@@ -104,6 +104,7 @@ class Category:
       shape: draws an instance from a numpy generator; None when only real data exist.
       viewpoint: cameras of generated frames.
       equivalences: declared ambiguities.
+      closed: the limit at which a joint is closed; None where that means nothing.
     """
 
     name: str
@@ -117,6 +118,7 @@ class Category:
     shape: Callable[[np.random.Generator], ObjectModel] | None = None
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
     equivalences: tuple[Equivalence, ...] = ()
+    closed: Literal["low", "high"] | None = "low"
 
     @property
     def num_parts(self) -> int:

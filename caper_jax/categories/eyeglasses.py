@@ -157,6 +157,7 @@ def shape(rng: np.random.Generator) -> ObjectModel:
 
 EYEGLASSES = Category(
     name="eyeglasses",
+    closed="high",
     parts=("frame", "temple at -x", "temple at +x"),
     joints=(
         Joint("revolute", parent=0, limits=(0.0, _FOLDED)),

@@ -221,6 +221,7 @@ def shape(rng: np.random.Generator) -> ObjectModel:
 
 ROBOTARM = Category(
     name="robotarm",
+    closed=None,
     parts=("base", "link 1", "link 2", "link 3", "link 4", "link 5", "link 6"),
     joints=tuple(
         Joint("revolute", parent=j, limits=(np.radians(low), np.radians(high)))

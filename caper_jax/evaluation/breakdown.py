@@ -41,11 +41,13 @@ def by_opening(errors: PoseErrors, state: np.ndarray, category: Category) -> lis
     Args:
       errors: of F frames.
       state: [F, J] true joint states, radians or metres.
-      category: knows the joints' limits, between which the opening is a share; states beyond count
-        as the limit.
+      category: knows the joints' limits, between which the opening is a share, and which of them is
+        closed; states beyond count as the limit.
     """
     low, high = np.array([joint.limits for joint in category.joints]).T
-    opening = np.clip((state - low) / (high - low), 0.0, 1.0).max(axis=1, keepdims=True)
+    opening = np.clip((state - low) / (high - low), 0.0, 1.0)
+    opening = 1.0 - opening if category.closed == "high" else opening
+    opening = opening.max(axis=1, keepdims=True)
     opening = np.round(np.broadcast_to(opening, errors.rotation_deg.shape), 6)
     return [
         {"opened": [low, high], "parts": _parts(errors, _within(opening, low, high), category)}
@@ -81,10 +83,9 @@ def format_bins(bins: list[dict[str, Any]], key: str) -> list[str]:
     for number in range(len(bins[0]["parts"])):
         for content in bins:
             part = content["parts"][number]
-            cells = ["-", "-"]
             if part["frames"]:
                 cells = [cell(part["rotation_deg"], 1, 2), cell(part["translation_m"], 1000, 1)]
-            rows.append([part["name"], share(content[key]), str(part["frames"]), *cells])
+                rows.append([part["name"], share(content[key]), str(part["frames"]), *cells])
     return align(rows)
 
 

@@ -36,10 +36,11 @@ def summarise(
     """The content of metrics.json: counts, and mean and median of every error.
 
     Failed frames are in every mean and median, with the values that "failure_value" names.
-    "by_opening" holds the errors of frames in which the object is closed, ajar or open, and, where
-    the data say how much of each part is visible, "by_occlusion" those of the parts within each bin
-    of paper Table 8. For a category with declared equivalences, "up_to_symmetry" holds the errors
-    against the better reading of the truth; all the others never do.
+    "by_opening" holds the errors of frames in which the object is closed, ajar or open, where the
+    category knows such a thing, and, where the data say how much of each part is visible,
+    "by_occlusion" those of the parts within each bin of paper Table 8. For a category with declared
+    equivalences, "up_to_symmetry" holds the errors against the better reading of the truth; all the
+    others never do.
 
     Args:
       evaluation: from ``protocol.evaluate``.
@@ -62,8 +63,10 @@ def summarise(
         "predictor": predictor,
         "weights": weights,
         "failure_value": FAILURE_VALUES,
-        "by_opening": by_opening(errors, np.asarray(evaluation.truth.joint_state), category),
     }
+    if category.closed:
+        state = np.asarray(evaluation.truth.joint_state)
+        report["by_opening"] = by_opening(errors, state, category)
     if not np.isnan(evaluation.visibility).all():
         report["by_occlusion"] = by_occlusion(errors, evaluation.visibility, category)
     if category.equivalences:
@@ -147,8 +150,9 @@ def format_report(report: dict[str, Any]) -> str:
         "",
         *format_tables(report),
     ]
-    lines += ["", "by how far the most open joint is open, of its limits:"]
-    lines += format_bins(report["by_opening"], "opened")
+    if "by_opening" in report:
+        lines += ["", "by how far the most open joint is open, of its limits:"]
+        lines += format_bins(report["by_opening"], "opened")
     if "by_occlusion" in report:
         lines += ["", "by the share of the part that is occluded:"]
         lines += format_bins(report["by_occlusion"], "occluded")

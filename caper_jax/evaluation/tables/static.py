@@ -68,6 +68,7 @@ def run(name: str, options: Options) -> Report:
     tables = [Table("Mean errors of one frame", HEADER, rows, comparison.LABELS)]
     if spreads:
         tables.append(Table("All errors, mean / median", SPREAD_HEADER, spreads, comparison.LABELS))
+    if openings:
         tables.append(Table(_OPENING_TITLE, OPENING_HEADER, openings, 1))
     return Report(
         title=paper.title,
@@ -131,7 +132,7 @@ def spread_rows(category: str, label: str, tables: dict[str, Any]) -> list[list[
 def opening_rows(category: str, found: dict[str, Any]) -> list[list[str]]:
     """One row per bin of ``breakdown.by_opening`` that has frames."""
     rows = []
-    for content in found["by_opening"]:
+    for content in found.get("by_opening", ()):
         root = content["parts"][0]
         if root["frames"]:
             cells = [
