@@ -234,6 +234,31 @@ def test_every_configuration_file_is_valid(name):
     assert update(base, ROOT / "configs" / f"{name}.toml").category == "box"
 
 
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("calibration_frames=100", "calibration needs 320 frames or more, got 100"),
+        ("sides_frames=500", "fitting sides needs 1024 frames or more, got 500"),
+        ("category=drawer", "--category says box, the configuration drawer"),
+    ],
+)
+def test_what_the_end_of_a_run_cannot_do_is_said_before_it_begins(
+    setting, message, tmp_path, capsys
+):
+    arguments = ["train", *TINY, "--set", "network.sides_width=16", "--set", setting]
+    assert cli.main([*arguments, "--steps", "1", "--out", str(tmp_path / "run")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_calibrate_counts_frames_before_it_changes_a_model(model, capsys):
+    before = {path.name: path.read_bytes() for path in model.iterdir() if path.is_file()}
+    arguments = ["calibrate", "--category", "box", "--weights", str(model)]
+    assert cli.main([*arguments, "--sides", "1024", "--frames", "100"]) == 2
+    assert "calibration needs 320 frames or more" in capsys.readouterr().err
+    assert before == {path.name: path.read_bytes() for path in model.iterdir() if path.is_file()}
+
+
 def test_unknown_key_names_the_nearest(tmp_path, capsys):
     file = tmp_path / "wrong.toml"
     file.write_text("[training]\nlerning_rate = 1e-3\n")

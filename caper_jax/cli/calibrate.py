@@ -51,9 +51,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
     from caper_jax.estimator import load
     from caper_jax.model_files import CARD_FILE, write_card
-    from caper_jax.training.calibration import FRAMES, calibrate
+    from caper_jax.training.calibration import FRAMES, calibrate, check_frames
     from caper_jax.training.run import TRAINING_DATA
 
+    frames = arguments.frames or FRAMES
+    check_frames(frames)  # before anything is written
     if arguments.sides:
         from caper_jax.training import sides
 
@@ -61,7 +63,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         options = {"frames": number, "seed": arguments.seed}
         sides.add_sides(arguments.weights, arguments.category, TRAINING_DATA, **options)
     estimator = load(arguments.category, arguments.weights)
-    frames = arguments.frames or FRAMES
     section = calibrate(estimator, TRAINING_DATA, frames, arguments.seed)
     write_card(arguments.weights, {**estimator.card, "calibration": section})
     print(f"written: {arguments.weights / CARD_FILE} (calibrated on {frames} frames)")

@@ -148,6 +148,10 @@ def _configuration(category: str, arguments: argparse.Namespace, initial: Path |
         config = update(config, arguments.config)
     config = _with_dataset(config, arguments)
     config = override(config, *arguments.overrides)
+    if config.category != category:
+        raise CaperError(
+            f"--category says {category}, the configuration {config.category}: remove one"
+        )
     budget = {"minutes": arguments.minutes, "steps": arguments.steps}
     if any(value is not None for value in budget.values()):
         config = dataclasses.replace(

@@ -46,8 +46,7 @@ def calibrate(
     Raises:
       CaperError: too few frames.
     """
-    if frames < 10 * _BATCH:
-        raise CaperError(f"calibration needs {10 * _BATCH} frames or more, got {frames}")
+    check_frames(frames)
     cameras = tuple(name for name in config.noise if name in CAMERAS) or config.noise
     config = replace(config, noise=cameras)
     measure = jax.jit(partial(_measure, estimator=estimator))
@@ -70,6 +69,12 @@ def calibrate(
     rounded = {name: np.round(np.asarray(value), 5).tolist() for name, value in section.items()}
     data = {"frames": frames, "split": SPLIT, "seed": seed, "noise": list(cameras)}
     return {**rounded, "coverage": COVERAGE, **data}
+
+
+def check_frames(frames: int) -> None:
+    """Raises CaperError where so many frames are too few to calibrate on."""
+    if frames < 10 * _BATCH:
+        raise CaperError(f"calibration needs {10 * _BATCH} frames or more, got {frames}")
 
 
 def mixed_frames(

@@ -36,6 +36,7 @@ from caper_jax.networks.caper import NetworkConfig
 from caper_jax.networks.presets import PRESETS as NETWORKS
 from caper_jax.training import parallel, sides
 from caper_jax.training.calibration import FRAMES, calibrate
+from caper_jax.training.calibration import check_frames as check_calibration
 from caper_jax.training.loop import FitResult, TrainingConfig, fit
 from caper_jax.training.losses import LossWeights
 from caper_jax.training.task import LossConfig, Task
@@ -92,6 +93,11 @@ class RunConfig:
     def __post_init__(self) -> None:
         if not 0.0 <= self.start_share < 1.0:
             raise CaperError(f"start_share must be in [0, 1), got {self.start_share}")
+        # Both happen at the end of a run, too late to say that they cannot.
+        if self.loader is None and self.network.sides_width:
+            sides.check_frames(self.sides_frames)
+        if self.loader is None and self.calibration_frames:
+            check_calibration(self.calibration_frames)
         if self.data.num_points != self.network.num_points:
             raise CaperError(
                 f"data.num_points = {self.data.num_points} and network.num_points = "

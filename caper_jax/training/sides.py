@@ -65,8 +65,7 @@ def fit_sides(
     Raises:
       CaperError: too few frames; TurnedModel, a model that is turned in nearly all of them.
     """
-    if frames < 2 * _BATCH:
-        raise CaperError(f"fitting sides needs {2 * _BATCH} frames or more, got {frames}")
+    check_frames(frames)
     network = replace(estimator.network, sides_width=0)
     first = _regressed(estimator, network, config, width, max(frames // 4, 2 * _BATCH), seed + 1)
     # Then both what the stages find and what the first round makes of it.
@@ -74,6 +73,12 @@ def fit_sides(
     estimator = Estimator(estimator.category, network, {**estimator.variables, "params": params})
     network = replace(network, sides_width=width, sides_passes=1)
     return _regressed(estimator, network, config, width, frames, seed + 2)
+
+
+def check_frames(frames: int) -> None:
+    """Raises CaperError where so many frames are too few to fit sides on."""
+    if frames < 2 * _BATCH:
+        raise CaperError(f"fitting sides needs {2 * _BATCH} frames or more, got {frames}")
 
 
 def _regressed(
