@@ -9,7 +9,7 @@ import pytest
 from frames import random_pose
 from PIL import Image
 
-from caper_jax import cli
+from caper_jax import cli, estimator
 from caper_jax.estimator import Prediction
 
 CAMERA = {"fx": 300.0, "fy": 310.0, "cx": 79.5, "cy": 59.5}
@@ -112,6 +112,14 @@ def test_clouds_and_depth_scale(files, seen):
         Image.fromarray(np.asarray(image) * np.uint16(10)).save("fine.png")
     assert run(*IMAGE, "--mask", "mask.png", "--depth", "fine.png", "--depth-scale", "1e-4") == 0
     np.testing.assert_allclose(seen[1][..., 2], 0.78, rtol=1e-6)
+
+
+def test_objects_of_another_scale(files, seen, monkeypatch):
+    asked = []
+    load = estimator.load
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *a: asked.append(a) or load(*a))
+    assert run("--points", "cloud.npy", "--object-scale", "2.5") == 0
+    assert asked == [("box", None, 2.5)]
 
 
 def test_pictures_and_pages_are_written(files, seen):
