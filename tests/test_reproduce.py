@@ -169,6 +169,7 @@ def test_the_declared_symmetry_has_rows_of_its_own(tmp_path):
         truths = [frame.truth for frame in source.frames(name)]
         truth = jax.tree.map(lambda *rows: np.stack(rows), *truths)
         (equivalence,) = LAPTOP.equivalences
+        truth.size[:, 1] = truth.size[:, 0] @ np.abs(np.array(equivalence.turn))
         tracks.append(track(name, truth, second_reading(truth, equivalence, LAPTOP)))
     found = runs.summarise(tracks, source, runs.Condition())
     assert found["frames"] == 6 and found["mean_diagonal_m"] > 0

@@ -322,6 +322,7 @@ class TestCorrected:
             lost, due = (flags.pop(name, False) for name in ("lost", "due"))
             doubtful = np.int32(flags.pop("doubtful", 3 * flags.pop("doubted", False)))
             turned = np.int32(flags.pop("turned", 0))
+            trial = flags.pop("trial", 0)
             turn, shift, state = estimate
             tracked = laptop_fix(ROOT, 0.5)
             static = laptop_fix(ROOT @ rigid([0, turn, 0], [0, shift, 0]), state)
@@ -338,9 +339,12 @@ class TestCorrected:
                 programs[key] = quick_jit(corrected)
             points = in_camera(INSIDE, tracked if fits == "track" else static)
             state = {"variance": np.float32(variance) * np.ones(3, np.float32), "lost": lost}
+            state |= {"vote": np.zeros(24, np.float32), "trial": np.int32(trial)}
             static = replace(static, sure=np.float32(sure))
-            fix, *found = programs[key](static, points, tracked, state, due, doubtful, turned)
-            assert found.pop(2) == (bool(found[1]) and (sure >= 0.5 or doubtful >= 5))
+            said = programs[key](static, points, tracked, state, due, doubtful, turned)
+            fix, found = said.fix, (said.variance, said.asked, said.replaced)
+            assert said.sure == (bool(said.asked) and (sure >= 0.5 or doubtful >= 5))
+            assert said.vote.any() == (bool(said.sure) and trial > 0)
             along = np.linalg.inv(tracked.root) @ np.asarray(fix.root, float)
             turned = Rotation.from_matrix(along[:3, :3]).as_rotvec()[1]
             lid = Rotation.from_matrix(fix.parts[1, :3, :3]).as_rotvec()
@@ -366,6 +370,11 @@ class TestCorrected:
             found, self.TRACK + gain * (self.ESTIMATE - self.TRACK), rtol=1e-3, atol=1e-4
         )
         np.testing.assert_allclose(after, gain * self.STATIC, rtol=1e-4)
+
+    def test_on_trial_the_estimator_is_asked_and_averaged(self, run):
+        found, _, asked, replaced = run(variance=0.01, trial=5)
+        assert asked and not replaced
+        np.testing.assert_allclose(found[:2], [0.05, 0.1], atol=1e-3)  # of equal variances
 
     def test_a_track_without_variance_is_kept(self, run):
         """Doubted, but not by the policy: it did not drift. It fits, so it is not replaced."""
