@@ -19,7 +19,7 @@ from jax import export
 
 from caper_jax._version import __version__
 from caper_jax.articulation.category import Category
-from caper_jax.data.cloud import MIN_POINTS
+from caper_jax.data.cloud import FARTHEST_M, MIN_POINTS
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.estimator import Estimator, Prediction
 from caper_jax.files import write_atomically
@@ -31,7 +31,7 @@ FRAME = "camera, OpenCV: x right, y down, z forward"
 ANY_BATCH = "batch"  # stands for the size in shapes that leave it open
 
 _SAMPLING = (
-    "leave out points that are NaN, infinite or exactly zero, ask for "
+    f"leave out points that are NaN, exactly zero or beyond {FARTHEST_M:g} m, ask for "
     f"{MIN_POINTS} or more of the remaining n, sort them into some 32 rows of the image, within a "
     "row by columns, and take those at floor((i + 0.5) n / num_points), i = 0 .. num_points - 1; "
     "the order of the points taken does not matter"

@@ -84,26 +84,8 @@ class Tracker:
                 f"the first frame shows too few points to begin with; at least {MIN_POINTS} are "
                 "needed"
             )
-        parts = self.estimator.category.num_parts
-        try:
-            rotation = np.asarray(rotation, np.float32)
-            translation = np.asarray(translation, np.float32)
-        except (TypeError, ValueError) as error:
-            raise CaperError(f"the first pose must be numbers ({error})") from error
-        if rotation.shape != (parts, 3, 3) or translation.shape != (parts, 3):
-            raise CaperError(
-                f"the first pose must be rotation [{parts}, 3, 3] and translation [{parts}, 3], "
-                f"got {list(rotation.shape)} and {list(translation.shape)}"
-            )
-        off = np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)).max()
-        if not (off < _RIGID and (np.linalg.det(rotation) > 0).all()):  # NaN is not less
-            raise CaperError("the first pose's rotation must hold rotation matrices")
-        if not (np.abs(translation) <= FARTHEST_M).all():
-            raise CaperError(
-                f"the first pose's translation must be metres, at most {FARTHEST_M:g}, "
-                f"got {np.abs(translation).max():.4g}"
-            )
-        self.state = self._given(self.estimator.variables, frame, rotation, translation)
+        pose = _first_pose(rotation, translation, self.estimator.category.num_parts)
+        self.state = self._given(self.estimator.variables, frame, *pose)
 
     def observe(self, points, labels=None) -> Observation:
         """A frame of any number of points as the step takes it.
@@ -161,6 +143,29 @@ class Tracker:
 
     def _through(self, variables, state: TrackerState, observations: Observation):
         return jax.lax.scan(partial(self.function, variables), state, observations)
+
+
+def _first_pose(rotation, translation, parts: int) -> tuple[np.ndarray, np.ndarray]:
+    """A given pose as float32 [K, 3, 3] and [K, 3]; CaperError unless it is rigid, in metres."""
+    try:
+        rotation = np.asarray(rotation, np.float32)
+        translation = np.asarray(translation, np.float32)
+    except (TypeError, ValueError) as error:
+        raise CaperError(f"the first pose must be numbers ({error})") from error
+    if rotation.shape != (parts, 3, 3) or translation.shape != (parts, 3):
+        raise CaperError(
+            f"the first pose must be rotation [{parts}, 3, 3] and translation [{parts}, 3], "
+            f"got {list(rotation.shape)} and {list(translation.shape)}"
+        )
+    off = np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)).max()
+    if not (off < _RIGID and (np.linalg.det(rotation) > 0).all()):  # NaN is not less
+        raise CaperError("the first pose's rotation must hold rotation matrices")
+    if not (np.abs(translation) <= FARTHEST_M).all():
+        raise CaperError(
+            f"the first pose's translation must be metres, at most {FARTHEST_M:g}, "
+            f"got {np.abs(translation).max():.4g}"
+        )
+    return rotation, translation
 
 
 def config_for(estimator: Estimator, *assignments: str) -> TrackerConfig:

@@ -173,6 +173,7 @@ def test_the_runner_picks_the_points_that_the_package_picks(drawer):
     runner = runpy.run_path(str(folder / "run.py"))
     rng = np.random.default_rng(0)
     dense = rng.normal([0.0, 0.1, 1.0], [0.3, 0.2, 0.1], (20_000, 3)).astype(np.float32)
+    dense[::100, 1] = np.resize([np.nan, np.inf, 3e38, -60.0], 200)  # no measurements, all
     picked = runner["sample"](dense)
     np.testing.assert_array_equal(picked, sample_points(dense, len(picked)).points)
 

@@ -25,6 +25,7 @@ from caper_jax.tracking.state import Observation
 
 LAPTOP = categories.get("laptop")
 VIDEOS, FRAMES = 4, 20
+HALF_TURN = np.diag([-1.0, 1.0, -1.0])
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +43,14 @@ def tracker():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jax, "jit", quick_jit)
         return load_tracker("laptop")
+
+
+def undoubting(tracker, **settings):
+    """That tracker, but it asks the estimator on trial only."""
+    settings = replace(tracker.config, policy="promote", patience=1000, **settings)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax, "jit", quick_jit)
+        return Tracker(tracker.estimator, settings)
 
 
 class Player:
@@ -146,14 +155,10 @@ class TestShipped:
 
     def test_a_track_that_is_off_by_a_turn_is_turned_back(self, tracker, videos):
         """By what stage II sees alone: the estimator is not asked. Not so what the user gave."""
-        settings = replace(tracker.config, policy="promote", patience=1000)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(jax, "jit", quick_jit)
-            player = Player(Tracker(tracker.estimator, settings), videos)
-        half = np.diag([-1.0, 1.0, -1.0])
+        player = Player(undoubting(tracker), videos)
         right = []
         for video in range(VIDEOS):
-            player.begin(video, half)
+            player.begin(video, HALF_TURN)
             errors, _ = player.play(video, range(1, 3))
             assert errors.min() > 150
             nothing = np.zeros_like(player.tracker.state.turn)
@@ -164,14 +169,10 @@ class TestShipped:
 
     def test_a_start_that_is_off_by_a_turn_is_outvoted(self, tracker, videos):
         """By estimates of the next frames, and only while it is on trial."""
-        settings = replace(tracker.config, policy="promote", patience=1000, turned=1.5)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(jax, "jit", quick_jit)
-            player = Player(Tracker(tracker.estimator, settings), videos)
-        half = np.diag([-1.0, 1.0, -1.0])
+        player = Player(undoubting(tracker, turned=1.5), videos)
         right = []
         for video in range(VIDEOS):
-            player.begin(video, half)
+            player.begin(video, HALF_TURN)
             # Stage II is kept from speaking.
             silent = replace(player.tracker.state, vote=np.zeros(24, np.float32))
             player.tracker.state = silent

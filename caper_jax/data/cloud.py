@@ -179,7 +179,7 @@ def as_cloud(points, where: str = "points") -> np.ndarray:
     if points.dtype.kind not in "fiu":
         raise CaperError(f"{where}: a cloud must be numbers in metres, got {points.dtype}")
     with np.errstate(over="ignore"):
-        return points.astype(np.float32)
+        return points.astype(np.float32, copy=False)
 
 
 def sample_points(

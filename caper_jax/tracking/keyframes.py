@@ -86,8 +86,8 @@ def corrected(
 
     Where the track is in order, the static estimator's pose is weighed against it by their
     variances, one Kalman step on the manifold; where it is lost, or doubted and worse than the
-    estimate by its own measure, the estimate replaces it. Where it is off by a whole turn, what
-    stage II sees after that turn does.
+    estimate by its own measure, the estimate replaces it. Where it is off by a whole turn, by what
+    stage II saw or as estimates outvoted a start on trial, what stage II sees after that turn does.
 
     Args:
       variables, points, labels, category, network: as for ``fix.measure``.

@@ -21,7 +21,7 @@ def outline(x):  # the model's inputs and outputs; what happens in between is in
 
 
 def sample(points):  # without what is no measurement, as many points as the model takes, evenly
-    points = points[np.isfinite(points).all(-1) & (points != 0).any(-1)]
+    points = points[(np.abs(points) <= 50).all(-1) & (points != 0).any(-1)]
     assert len(points) >= 16, f"only {len(points)} usable points"
     if len(points) > SHAPE[1]:  # into rows of the image, to and fro
         x, y = (points[:, :2] / np.maximum(points[:, 2:], max(points[:, 2].mean() / 2, 1e-6))).T
