@@ -2,7 +2,8 @@
 
 The dataclasses live with their users (data, networks, training); here is only the machinery. A
 field may be a bool, int, float, str, ``Literal``, tuple, another dataclass, or one of these or
-None. TOML has no null: a key that is absent takes the field's default.
+None. TOML has no null: a key that is absent takes the field's default. Of the fields that a
+dataclass lists in ``ALTERNATIVES`` at most one is set: naming one unsets the others.
 """
 
 from __future__ import annotations
@@ -69,16 +70,32 @@ def update(config: T, path: str | Path) -> T:
       CaperError: the file cannot be read, or holds an unknown key or a wrong value.
     """
     values = to_dict(config)
-    _merge(values, _read_toml(path))
+    _merge(values, _read_toml(path), type(config))
     return from_dict(type(config), values, str(path))
 
 
-def _merge(values: dict[str, Any], changes: dict[str, Any]) -> None:
+def _merge(values: dict[str, Any], changes: dict[str, Any], cls: type) -> None:
+    kinds = typing.get_type_hints(cls)
+    for key in changes:
+        _unset_alternatives(values, cls, key)
     for key, change in changes.items():
         if isinstance(change, dict) and isinstance(values.get(key), dict):
-            _merge(values[key], change)
+            _merge(values[key], change, _without_none(kinds[key]))
         else:
             values[key] = change
+
+
+def _unset_alternatives(values: dict[str, Any], cls: type, key: str) -> None:
+    alternatives = getattr(cls, "ALTERNATIVES", ())
+    if key in alternatives:
+        values.update((other, None) for other in alternatives if other != key)
+
+
+def _without_none(kind: Any) -> Any:
+    """``T`` of ``T | None``, other types as they are."""
+    inner = [a for a in typing.get_args(kind) if a is not type(None)]
+    optional = typing.get_origin(kind) in (typing.Union, types.UnionType)
+    return inner[0] if optional and len(inner) == 1 else kind
 
 
 def _read_toml(path: str | Path) -> dict[str, Any]:
@@ -187,13 +204,15 @@ def _assign(values: dict[str, Any], cls: type, assignment: str) -> None:
     *sections, name = key.split(".")
     prefix = ""
     for section in sections:
-        cls = _field_type(cls, section, prefix, assignment)
+        cls = _without_none(_field_type(cls, section, prefix, assignment))
         prefix += section + "."
         if not dataclasses.is_dataclass(cls):
             raise CaperError(f"override {assignment!r}: {prefix[:-1]} is not a section")
+        if values.get(section, {}) is None:
+            raise CaperError(f"override {assignment!r}: there is no {prefix[:-1]} in this run")
         values = values.setdefault(section, {})
     kind = _field_type(cls, name, prefix, assignment)
-    if dataclasses.is_dataclass(kind):
+    if dataclasses.is_dataclass(_without_none(kind)):
         raise CaperError(f"override {assignment!r}: {key} is a section; name a key in it")
     try:
         values[name] = tomllib.loads(f"value = {text}")["value"]
@@ -204,6 +223,8 @@ def _assign(values: dict[str, Any], cls: type, assignment: str) -> None:
         values[name] = None
     elif not isinstance(values[name], str) and _holds_only_strings(kind):
         values[name] = text  # a name that happens to read as a number, date or boolean
+    if values[name] is not None:
+        _unset_alternatives(values, cls, name)
 
 
 def _field_type(cls: type, name: str, prefix: str, assignment: str) -> Any:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterable
+from typing import Any
 
 
 class CaperError(ValueError):
@@ -20,3 +22,18 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> CaperError:
     near = difflib.get_close_matches(name, names, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return CaperError(f"unknown {kind} {name!r}{hint} (known: {', '.join(names)})")
+
+
+def check_least(section: str, config: Any, **bounds: float) -> None:
+    """CaperError for a number of a configuration that is below its bound, or not finite.
+
+    Args:
+      section: where a configuration file has it, for the message.
+      config: holds the numbers as attributes; a tuple of numbers is held to the bound in each.
+      **bounds: the least value of each.
+    """
+    for name, low in bounds.items():
+        value = getattr(config, name)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if not all(low <= number < math.inf for number in numbers):
+            raise CaperError(f"{section}.{name} must be at least {low}, got {value}")

@@ -125,10 +125,38 @@ def test_mistakes_in_an_override_are_named(assignment, message):
 def test_overrides_of_a_file_are_validated_together(tmp_path):
     path = tmp_path / "t.toml"
     path.write_text("steps = 100\nbatch_size = 8\n")
-    got = configuration.load(path, TrainingConfig, "steps=none", "minutes=2.5")
+    got = configuration.load(path, TrainingConfig, "minutes=2.5", "steps=none")
     assert (got.steps, got.minutes, got.batch_size) == (None, 2.5, 8)
     with pytest.raises(CaperError, match="either steps or minutes"):
-        configuration.load(path, TrainingConfig, "minutes=2.5")
+        configuration.load(path, TrainingConfig, "steps=none")
+
+
+def test_of_alternatives_the_one_named_last_holds(tmp_path):
+    path = tmp_path / "t.toml"
+    preset = TrainingConfig(minutes=60.0)
+    path.write_text("steps = 100\n")
+    assert configuration.update(preset, path) == TrainingConfig(steps=100)
+    assert configuration.load(path, TrainingConfig, "minutes=2.5") == TrainingConfig(minutes=2.5)
+    path.write_text("steps = 100\nminutes = 2.5\n")
+    with pytest.raises(CaperError, match="either steps or minutes"):
+        configuration.update(preset, path)
+
+
+@dataclass(frozen=True)
+class Optional:
+    layers: Layers | None = None
+
+
+def test_a_section_that_may_be_absent(tmp_path):
+    path = tmp_path / "t.toml"
+    path.write_text("[layers]\nwidth = 5\n")
+    got = configuration.update(Optional(), path)
+    assert got == Optional(Layers(5))
+    assert configuration.override(got, "layers.box=[1, 2]").layers == Layers(5, box=(1.0, 2.0))
+    with pytest.raises(CaperError, match="layers is a section"):
+        configuration.override(got, "layers=1")
+    with pytest.raises(CaperError, match=r"'layers.width=3': there is no layers in this run"):
+        configuration.override(Optional(), "layers.width=3")
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,9 @@ import pytest
 
 from caper_jax import categories, cli
 from caper_jax.configuration import to_dict, update
+from caper_jax.data.loader import LoaderConfig
 from caper_jax.errors import CaperError
-from caper_jax.model_files import read_model, write_model
+from caper_jax.model_files import read_model, write_card, write_model
 from caper_jax.training import run
 from caper_jax.visualization.curves import training_curves
 
@@ -73,6 +74,39 @@ def test_a_file_feeds_a_run_that_resumes_where_it_was(tmp_path, capsys):
     assert "holds split 'train', not 'val'" in capsys.readouterr().err
     assert cli.main(["train", *TINY, "--format", "caper", *steps, str(tmp_path / "four")]) == 2
     assert "--format goes with --data" in capsys.readouterr().err
+
+
+def test_a_run_that_ended_leaves_its_model_as_it_is(model, monkeypatch):
+    """What was fitted afterwards would be lost; only where the end was cut short is it repeated."""
+    card = read_model(model)[0]
+    assert card["complete"]
+    mine = {**card, "calibration": {"mine": 1}}
+    write_card(model, mine)
+    again = ["train", *TINY, "--steps", "10", "--out", str(model)]
+    assert cli.main(again) == 0
+    assert read_model(model)[0] == mine
+    write_card(model, {**mine, "complete": False})
+    assert cli.main(again) == 0
+    assert read_model(model)[0] == card
+
+
+def test_settings_of_the_loader_stand_beside_data(tmp_path, monkeypatch, capsys):
+    configs = []
+    ended = types.SimpleNamespace(finished=False, state=types.SimpleNamespace(step=0))
+    monkeypatch.setattr(run, "train", lambda config, *_: configs.append(config) or ended)
+    file = tmp_path / "mine.toml"
+    file.write_text('[loader]\nformat = "artimage"\nroot = "there"\nworkers = 7\n')
+    begin = ["train", "--category", "box", "--out", str(tmp_path / "run")]
+    data = ["--config", str(file), "--data", "here", "--set", "loader.prefetch=9"]
+    assert cli.main([*begin, *data]) == 130
+    assert configs[0].loader == LoaderConfig("artimage", "here", workers=7, prefetch=9)
+    assert cli.main([*begin, *data, "--format", "caper", "--split", "val"]) == 130
+    assert configs[1].loader == replace(configs[0].loader, format="caper", split="val")
+    file.write_text("[loader]\nworkers = 7\n")
+    assert cli.main([*begin, *data]) == 130
+    assert configs[2].loader == replace(configs[0].loader, format="caper")
+    assert cli.main([*begin, "--set", "loader.workers=7"]) == 2
+    assert "there is no loader in this run" in capsys.readouterr().err
 
 
 def test_another_configuration_in_the_same_folder_is_refused(model, capsys):
@@ -239,12 +273,16 @@ def test_every_configuration_file_is_valid(name):
     [
         ("calibration_frames=100", "calibration needs 320 frames or more, got 100"),
         ("sides_frames=500", "fitting sides needs 1024 frames or more, got 500"),
+        ("network.fast.width=0", "network.fast.width must be at least 1, got 0"),
+        ("network.fast.scales=[0.1, 0.0]", "network.fast.scales must be at least 0.001"),
+        ("network.turn_width=-1", "network.turn_width must be at least 0, got -1"),
+        ("loss.weights.twist=-1", "loss.weights.twist must be at least 0, got -1.0"),
+        ("loss.root_noise=nan", "loss.root_noise must be at least 0, got nan"),
+        ("loss.turned=1.5", "loss.turned is a fraction from 0 to 1, got 1.5"),
         ("category=drawer", "--category says box, the configuration drawer"),
     ],
 )
-def test_what_the_end_of_a_run_cannot_do_is_said_before_it_begins(
-    setting, message, tmp_path, capsys
-):
+def test_what_cannot_be_done_is_said_before_a_run_begins(setting, message, tmp_path, capsys):
     arguments = ["train", *TINY, "--set", "network.sides_width=16", "--set", setting]
     assert cli.main([*arguments, "--steps", "1", "--out", str(tmp_path / "run")]) == 2
     assert message in capsys.readouterr().err

@@ -292,7 +292,7 @@ def test_a_broken_configuration_or_metrics_file_is_named(tmp_path):
         ({"steps": None}, "either steps or minutes"),
         ({"steps": 0}, "training.steps must be positive"),
         ({"steps": None, "minutes": float("inf")}, "training.minutes must be positive"),
-        ({"batch_size": 0}, "training.batch_size must be 1 or more"),
+        ({"batch_size": 0}, "training.batch_size must be at least 1"),
         ({"seed": -1}, "training.seed must be in"),
         ({"optimizer": "adam"}, "did you mean 'adamw'"),
     ],

@@ -117,7 +117,7 @@ def _train(category: str, arguments: argparse.Namespace, out: Path, initial: Pat
     if not result.finished:
         print(f"stopped at step {steps}; the same command goes on from there")
         return common.EXIT_INTERRUPTED
-    print(f"trained {steps} steps; model written to {out}")
+    print(f"trained {steps} steps; the model is in {out}")
     _plot(category, out)
     return 0
 
@@ -144,9 +144,10 @@ def _configuration(category: str, arguments: argparse.Namespace, initial: Path |
         config = run.preset_of(initial, category)
     else:
         config = run.preset(arguments.preset or "fast", category)
-    if arguments.config is not None:
-        config = update(config, arguments.config)
     config = _with_dataset(config, arguments)
+    if arguments.config is not None:
+        # A file may say how --data is read, and does not replace it.
+        config = _with_dataset(update(config, arguments.config), arguments)
     config = override(config, *arguments.overrides)
     if config.category != category:
         raise CaperError(
@@ -172,7 +173,7 @@ def _with_dataset(config: RunConfig, arguments: argparse.Namespace) -> RunConfig
             if getattr(arguments, option) is not None:
                 raise CaperError(f"--{option} goes with --data")
         return config
-    source = LoaderConfig(arguments.format or "caper", str(arguments.data))
-    if arguments.split is not None:
-        source = dataclasses.replace(source, split=arguments.split)
-    return dataclasses.replace(config, loader=source)
+    given = {"format": arguments.format, "split": arguments.split, "root": str(arguments.data)}
+    given = {name: value for name, value in given.items() if value is not None}
+    source = config.loader or LoaderConfig("caper", given["root"])
+    return dataclasses.replace(config, loader=dataclasses.replace(source, **given))

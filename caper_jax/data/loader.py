@@ -14,7 +14,7 @@ import numpy as np
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.cloud import MIN_POINTS, systematic_indices
 from caper_jax.data.schema import Dataset, Frame, pose_problems
-from caper_jax.errors import CaperError
+from caper_jax.errors import CaperError, check_least
 from caper_jax.geometry.scan import scan_order
 
 
@@ -39,9 +39,7 @@ class LoaderConfig:
     cache_gib: float = 2.0
 
     def __post_init__(self) -> None:
-        for name, low in (("workers", 1), ("prefetch", 0), ("cache_gib", 0.0)):
-            if getattr(self, name) < low:
-                raise CaperError(f"loader.{name} must be at least {low}, got {getattr(self, name)}")
+        check_least("loader", self, workers=1, prefetch=0, cache_gib=0)
 
 
 @flax.struct.dataclass

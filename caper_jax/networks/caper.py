@@ -10,6 +10,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from caper_jax.errors import check_least
 from caper_jax.networks.fast_encoder import FastEncoder, FastEncoderConfig
 from caper_jax.networks.heads import HeadConfig, PointHead, PooledHead, unit_vectors
 from caper_jax.networks.hs_encoder import (
@@ -73,6 +74,19 @@ class NetworkConfig:
     joints: Literal["voting", "direct"] = "voting"
     num_points: int = 1024
     point_stride: int = 1
+
+    def __post_init__(self) -> None:
+        check_least(
+            "network",
+            self,
+            corrections=0,
+            turn_width=0,
+            turn_margin=0,
+            sides_width=0,
+            sides_passes=1,
+            num_points=1,
+            point_stride=1,
+        )
 
 
 def make_encoder(config: NetworkConfig) -> nn.Module:

@@ -15,6 +15,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from caper_jax.errors import check_least
 from caper_jax.networks.features import Features, Level
 from caper_jax.networks.graph import squared_distances
 from caper_jax.networks.layers import BatchNorm, Dense, max_over_points
@@ -44,6 +45,19 @@ class FastEncoderConfig:
     blocks: int = 2
     last: int = 384
     global_feature: bool = True
+
+    def __post_init__(self) -> None:
+        check_least(
+            "network.fast",
+            self,
+            centers=1,
+            centers_in_use=1,
+            stride=1,
+            scales=1e-3,
+            width=1,
+            blocks=0,
+            last=1,
+        )
 
 
 def local_moments(centers, points, scale):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import flax.linen as nn
 import jax.numpy as jnp
 
+from caper_jax.errors import check_least
 from caper_jax.networks.features import BlockDense, Features
 from caper_jax.networks.layers import (
     BatchNorm,
@@ -32,6 +33,9 @@ class HeadConfig:
     widths: tuple[int, int, int] = (1024, 256, 256)
     dropout: float = 0.2
     pool_first: bool = False
+
+    def __post_init__(self) -> None:
+        check_least("heads", self, widths=1, dropout=0)
 
 
 def _norm_relu(features, train: bool):

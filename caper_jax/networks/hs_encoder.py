@@ -11,6 +11,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from caper_jax.errors import check_least
 from caper_jax.networks.features import Features, Level
 from caper_jax.networks.graph import (
     directional_max,
@@ -52,6 +53,9 @@ class HSEncoderConfig:
     pooling: int = 4
     feature_space: bool = True
     global_feature: bool = True
+
+    def __post_init__(self) -> None:
+        check_least("network.hs", self, channels=1, neighbours=1, supports=1, pooling=1)
 
 
 def _uniform(bound: float):

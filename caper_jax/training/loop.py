@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
 
-from caper_jax.errors import CaperError
+from caper_jax.errors import CaperError, check_least
 from caper_jax.progress import progress as progress_display
 from caper_jax.training import parallel
 from caper_jax.training.checkpoints import Checkpoints
@@ -52,6 +52,8 @@ class TrainingConfig:
         or "local", each on its own rows, which needs one sum per step (see `make_step`).
     """
 
+    ALTERNATIVES: ClassVar = ("steps", "minutes")
+
     batch_size: int = 16
     learning_rate: float = 1e-4
     optimizer: OptimizerName = "ranger"
@@ -75,18 +77,17 @@ class TrainingConfig:
                 f"training needs either steps or minutes, got steps={self.steps}, "
                 f"minutes={self.minutes}"
             )
-        least = {
-            "batch_size": 1,
-            "steps_per_dispatch": 1,
-            "log_steps": 1,
-            "keep_checkpoints": 1,
-            "max_bad_steps": 1,
-            "warmup": 0,
-            "checkpoint_steps": 0,
-        }
-        for name, bound in least.items():
-            if getattr(self, name) < bound:
-                raise CaperError(f"training.{name} must be {bound} or more")
+        check_least(
+            "training",
+            self,
+            batch_size=1,
+            steps_per_dispatch=1,
+            log_steps=1,
+            keep_checkpoints=1,
+            max_bad_steps=1,
+            warmup=0,
+            checkpoint_steps=0,
+        )
         for name in ("steps", "minutes", "checkpoint_minutes"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:

@@ -12,6 +12,8 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
+from caper_jax.errors import check_least
+
 HeatmapKind = Literal["exponential", "scaled", "linear"]
 
 
@@ -35,6 +37,9 @@ class LossWeights:
     heatmap: float = 1.0
     offset: float = 1.0
     turn: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_least("loss.weights", self, **dict.fromkeys(self.__dataclass_fields__, 0))
 
 
 def _per_sample(values):

@@ -25,6 +25,8 @@ from caper_jax.data.synthetic.scene import Batch, Generator, GeneratorConfig
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.estimator import load, network_of
 from caper_jax.model_files import (
+    CARD_FILE,
+    WEIGHTS_FILE,
     flatten,
     read_card,
     read_model,
@@ -152,7 +154,7 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
     Args:
       config: the run.
       directory: gets config.json, metrics.jsonl, checkpoints/ and, once the budget is used up,
-        weights.npz and model.json.
+        weights.npz and model.json. The model of a run that had ended before stays as it is.
       initial: model directory whose weights the run starts from (its card is kept in the new
         one); by default the weights are random. A model of another category gives its encoders.
 
@@ -184,7 +186,7 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         result, draw_sample = _fit_generated(fit_task, config, category)
     else:
         result, draw_sample = _fit_dataset(fit_task, config, config.loader)
-    if result.finished and jax.process_index() == 0:
+    if result.finished and jax.process_index() == 0 and not _complete(directory, result):
         card = _card(config, result, draw_sample())
         if started_from is not None:
             card |= _with_origin(card, started_from)
@@ -194,7 +196,16 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         write_model(directory, trained, card)
         if config.loader is None:  # of the weights as they are stored, and once they are
             _finish(config, directory)
+        write_card(directory, {**read_card(directory), "complete": True})
     return result
+
+
+def _complete(directory: str | Path, result: FitResult) -> bool:
+    """Whether the directory has the model of this run with all that belongs to it."""
+    if not all((Path(directory) / name).is_file() for name in (CARD_FILE, WEIGHTS_FILE)):
+        return False
+    card = read_card(directory)
+    return bool(card.get("complete")) and card.get("steps") == int(result.state.step)
 
 
 def _finish(config: RunConfig, directory: str | Path) -> None:

@@ -13,7 +13,14 @@ from caper_jax.files import write_atomically
 
 # Keys of the configuration that a resumed run may change: they do not touch the result.
 _FREE_KEYS = frozenset(
-    {"training.checkpoint_minutes", "training.checkpoint_steps", "training.keep_checkpoints"}
+    {
+        "training.checkpoint_minutes",
+        "training.checkpoint_steps",
+        "training.keep_checkpoints",
+        "loader.workers",
+        "loader.prefetch",
+        "loader.cache_gib",
+    }
 )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.equivalence import is_ambiguous, second_labels, second_reading
 from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.errors import CaperError, check_least
 from caper_jax.geometry import se3, so3
 from caper_jax.geometry.directions import rotation_from_directions
 from caper_jax.geometry.scan import in_order, scan_order
@@ -63,6 +64,15 @@ class LossConfig:
     predicted_root: float = 0.5
     turned: float = 0.2
     root_input: Literal["whole", "root"] = "whole"
+
+    def __post_init__(self) -> None:
+        noise = {"state_penalty": 0, "root_noise_deg": 0, "root_noise": 0, "root_noise_spread": 1}
+        check_least("loss", self, **noise)
+        for name in ("predicted_root", "turned"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise CaperError(
+                    f"loss.{name} is a fraction from 0 to 1, got {getattr(self, name)}"
+                )
 
 
 class Task:
@@ -143,19 +153,25 @@ class Task:
         parts_losses, metrics = self._parts_losses(
             canonical[:, ::stride], parts, truth, labels[:, ::stride]
         )
+        # Seen from a turned reference, everything else would have to be said twice.
+        right = (turn == 0).astype(canonical.dtype)
+        metrics |= parts_losses
+        metrics = {
+            name: (v * right).sum() / jnp.maximum(right.sum(), 1.0) for name, v in metrics.items()
+        }
         if self.network.turn_width:
-            # Seen from a turned reference, everything else would have to be said twice.
-            right = (turn == 0).astype(canonical.dtype)
             parts_losses = {name: value * right for name, value in parts_losses.items()}
             parts_losses["turn"] = losses.turn_loss(parts.turn, turn)
+            metrics["turn"] = parts_losses["turn"].mean()
             metrics["turn_accuracy"] = (parts.turn.argmax(-1) == turn).mean()
             reference = turned_pose(reference, jnp.asarray(TURNS)[turn])
         increment_loss, off = self._increment_loss(parts.increment, reference, truth)
         parts_losses["twist"] = increment_loss
+        metrics["twist"] = increment_loss.mean()
         metrics["increment_deg"] = off
 
         total += losses.weighted_total(self.config.weights, parts_losses).mean()
-        metrics |= {name: value.mean() for name, value in (root_losses | parts_losses).items()}
+        metrics |= {name: value.mean() for name, value in root_losses.items()}
         error = so3.geodesic_distance(self._root_rotation(output), truth.rotation[:, 0])
         metrics["root_deg"] = jnp.degrees(jax.lax.stop_gradient(error)).mean()
         new_state = {
@@ -292,7 +308,7 @@ class Task:
         return loss, jnp.degrees(jax.lax.stop_gradient(off)).mean()
 
     def _parts_losses(self, points, output, truth: ArticulatedPose, labels):
-        """Losses of stage II, and metrics for people."""
+        """Losses of stage II, and metrics for people, both per sample."""
         config = self.config
         offsets = losses.axis_offsets(points, truth.joint_axis, truth.joint_pivot)
         distance = jnp.sqrt((offsets * offsets).sum(-1))
@@ -313,12 +329,10 @@ class Task:
             del parts["heatmap"], parts["offset"]
             # Not of unit length: from an axis that points the other way no gradient leads back.
             parts["direction"] = losses.direction_loss(output.direction[:, 0], truth.joint_axis)
-        right = (output.segmentation.argmax(-1) == labels).sum() / jnp.maximum(
-            (labels >= 0).sum(), 1
-        )
-        off = jnp.abs(output.state - truth.joint_state).mean(0)
-        metrics = {"segmentation_accuracy": right}
+        right = (output.segmentation.argmax(-1) == labels).sum(-1)
+        off = jnp.abs(output.state - truth.joint_state)
+        metrics = {"segmentation_accuracy": right / jnp.maximum((labels >= 0).sum(-1), 1)}
         for number, kind in enumerate(self.category.joint_types):
             name, factor = ("deg", 180 / np.pi) if kind == "revolute" else ("unit", 1.0)
-            metrics[f"state{number + 1}_{name}"] = off[number] * factor
+            metrics[f"state{number + 1}_{name}"] = off[:, number] * factor
         return parts, metrics

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from caper_jax.data.synthetic.masks import OCCLUDERS
 from caper_jax.data.synthetic.sensor import PRESETS
-from caper_jax.errors import CaperError, unknown_name
+from caper_jax.errors import CaperError, check_least, unknown_name
 
 _FRACTIONS = (
     "occlusion", "erosion", "table", "clutter", "spill", "residue", "dropout", "holes",
@@ -63,9 +63,7 @@ class GeneratorConfig:
     measure_visibility: bool = False
 
     def __post_init__(self) -> None:
-        for name, low in LEAST.items():
-            if getattr(self, name) < low:
-                raise CaperError(f"data.{name} must be at least {low}, got {getattr(self, name)}")
+        check_least("data", self, **LEAST)
         for name in _FRACTIONS:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise CaperError(
