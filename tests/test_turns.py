@@ -109,6 +109,23 @@ def test_only_turn_and_increment_are_learned_from_turned_references():
     }
 
 
+def test_what_is_logged_is_of_references_that_are_not_turned(monkeypatch):
+    made = turning_task(CABINET)
+    batch = frames(CABINET, np.array([CABINET.mean_size] * 3), count=64)
+    variables = made.init(jax.random.key(0))
+    state = {name: value for name, value in variables.items() if name != "params"}
+    found = {"state": jnp.array([1.0, 9.0, 2.0])}, {"state1_unit": jnp.array([3.0, 9.0, 5.0])}
+    monkeypatch.setattr(made, "_parts_losses", lambda *_: found)
+
+    def logged(*turn):
+        monkeypatch.setattr(made, "_turned", lambda _, reference, __: (reference, jnp.array(turn)))
+        metrics = made.loss(variables["params"], state, batch, jax.random.key(1), 0.0)[1][1]
+        return float(metrics["state"]), float(metrics["state1_unit"])
+
+    assert logged(0, 7, 0) == (1.5, 4.0)
+    assert logged(7, 7, 7) == (0.0, 0.0)
+
+
 def test_the_estimator_makes_the_turn_that_stage_two_asks_for():
     """A head with a constant answer turns every root by it, about the root's origin."""
     config = dataclasses.replace(network("fast", pool_first=True), turn_width=8)
