@@ -49,6 +49,10 @@ def test_a_name_is_registered_once(monkeypatch):
     assert categories.get("crate") is crate and "crate" in categories.names()
 
 
+EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+MIRROR = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
 def define(**changes) -> Category:
     values = {
         "name": "chain",
@@ -76,7 +80,16 @@ def test_a_definition_counts_its_parts():
         ({"parts": ("a", "b")}, "2 parts need 1 joints"),
         ({"joints": (Joint("revolute", 0, (0, 1)), Joint("revolute", 2, (0, 1)))}, "part 2 must"),
         ({"joints": (Joint("revolute", -1, (0, 1)),) * 2}, "part 1 must come after its parent -1"),
-        ({"joints": (Joint("revolute", 0, (1.0, 1.0)),) * 2}, "part 1 has empty limits"),
+        ({"joints": (Joint("revolute", 0, (1.0, 1.0)),) * 2}, "part 1 must have finite limits"),
+        ({"joints": (Joint("revolute", 0, (0, np.inf)),) * 2}, "part 1 must have finite limits"),
+        ({"joints": (Joint("revolut", 0, (0, 1)),) * 2}, "'revolut'; did you mean 'revolute'"),
+        ({"directions": ("y", "w")}, "directions are two of x, y, z"),
+        ({"mean_size": ((1.0, 1.0, 0.0),) * 3}, "mean_size must be positive"),
+        ({"mean_center": ((0.0, 0.0, np.nan),) * 3}, "mean_center must be finite"),
+        ({"unit": -1.0}, "unit and mean_size must be positive"),
+        ({"closed": "shut"}, "closed is 'low', 'high' or None, got 'shut'"),
+        ({"equivalences": (Equivalence((0, 1), EYE, "why"),)}, "must permute the parts"),
+        ({"equivalences": (Equivalence((2, 1, 0), MIRROR, "why"),)}, "is not a rotation"),
         ({"directions": ("y", "y")}, "two directions must differ"),
         ({"mean_size": ((1.0, 1.0, 1.0),) * 2}, r"mean_size must be \[3, 3\]"),
         ({"mean_center": ((0.0, 0.0),) * 3}, r"mean_center must be \[3, 3\]"),
@@ -85,6 +98,11 @@ def test_a_definition_counts_its_parts():
 def test_mistakes_in_a_definition_name_the_category(changes, message):
     with pytest.raises(CaperError, match=f"category 'chain': .*{message}"):
         define(**changes)
+
+
+def test_a_scaled_category_draws_no_shapes_of_another_size():
+    box = categories.get("box")
+    assert box.scaled(1.0) is box and box.scaled(2.0).shape is None
 
 
 @pytest.mark.parametrize(

@@ -158,6 +158,12 @@ def test_directions_of_motion():
     np.testing.assert_array_equal(slid[:3], np.c_[np.eye(3), [0, 0.25, 0]])
 
 
+def test_a_sliding_joint_needs_no_pivot():
+    nowhere = np.full(3, np.nan)
+    slid = joints.joint_transform("prismatic", [0.0, 3.0, 0.0], nowhere, 0.25)
+    np.testing.assert_array_equal(slid, joints.prismatic_transform([0.0, 3.0, 0.0], 0.25))
+
+
 def test_small_turns_about_far_pivots_keep_their_digits():
     # q - R q would leave the rounding of q: 1e-6 m here, a thousandth of the motion.
     revolute = quick_jit(joints.revolute_transform)

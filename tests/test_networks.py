@@ -175,6 +175,10 @@ def test_votes_without_heat_stay_finite():
         found_axis, pivot = vote(jnp.asarray(points), heatmap, offset, votes)
         return found_axis.sum() + pivot.sum()
 
+    # All points weigh the same.
+    found = vote(jnp.asarray(points), np.zeros((3, 50, 2)), offset, votes)
+    np.testing.assert_allclose(found[1], (points[:, :, None] + offset).mean(1), rtol=1e-4)
+
     arguments = map(jnp.asarray, (np.zeros((3, 50, 2)), offset, votes))
     value, gradients = jax.jit(jax.value_and_grad(total, (0, 1, 2)))(*arguments)
     assert np.isfinite(value)

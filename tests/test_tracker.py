@@ -22,6 +22,7 @@ from caper_jax.tracker import Tracker
 from caper_jax.tracking.config import TrackerConfig
 from caper_jax.tracking.registration import RegistrationConfig
 from caper_jax.tracking.state import Observation
+from caper_jax.tracking.step import given_state
 
 LAPTOP = categories.get("laptop")
 VIDEOS, FRAMES = 4, 20
@@ -318,6 +319,25 @@ def test_scans_loops_vmaps_and_slopes():
             states, found = step(states, frame)
             expected = jax.tree.map(lambda leaf, at=number: leaf[:, at], scans)
             jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6), found, expected)
+
+
+def test_float32_weights_and_clouds_in_64_bit_jax():
+    """Every step gives a state of the types it took: scans need that."""
+    with jax.enable_x64(True):
+        tracker = load_tracker("box")  # weights and clouds are float32, constants are not
+        begin = jax.eval_shape(tracker.initial_state)
+        frame = tracker.observe(np.random.default_rng(0).normal((0, 0, 1), 0.1, (500, 3)))
+        weights = tracker.estimator.variables
+        after, found = jax.eval_shape(tracker.function, weights, begin, frame)
+        settings = (tracker.estimator.category, tracker.estimator.network, tracker.config)
+        poses = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3))
+        given = jax.eval_shape(lambda *a: given_state(*a, *poses, *settings), weights, frame)
+    begun, *others = (
+        [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(state)]
+        for state in (begin, after, given)
+    )
+    assert others == [begun, begun]
+    assert found.pose.rotation.dtype == begin.root.dtype == np.float64
 
 
 def test_slopes_remember_the_states_between_frames_alone():

@@ -204,6 +204,9 @@ class TestIncrement:
 
     def test_euclidean_is_a_rotation_whatever_comes_out(self):
         numbers = np.float32(np.random.default_rng(2).normal(size=(50, 9)))
+        numbers[0, :3] = (-1, 0, 0)  # no first axis
+        numbers[1, 3:6] = numbers[1, :3] + (1, -1, 0)  # twice the same
+        numbers[2, :6] = (-1, 0, 0, 0, -1, 0)  # none
         turn = np.asarray(self.transform(numbers, "euclidean"), float)[:, :3, :3]
         np.testing.assert_allclose(turn @ turn.swapaxes(1, 2), np.eye(3) + 0 * turn, atol=2e-6)
         np.testing.assert_allclose(np.linalg.det(turn), 1.0, atol=2e-6)

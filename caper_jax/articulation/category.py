@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -145,6 +145,8 @@ class Category:
     def scaled(self, factor: float) -> Category:
         """The category of objects that are ``factor`` times as large; same networks, same weights.
 
+        It draws no shapes: the ones of the category are of its own size.
+
         Raises:
           CaperError: a factor that is not positive.
         """
@@ -170,10 +172,11 @@ class Category:
             joints=joints,
             mean_size=times(self.mean_size),
             mean_center=times(self.mean_center),
+            shape=None,
         )
 
     def __post_init__(self) -> None:
-        from caper_jax.errors import CaperError
+        from caper_jax.errors import CaperError, unknown_name
 
         where = f"category {self.name!r}"
         if len(self.parts) != len(self.joints) + 1:
@@ -181,10 +184,33 @@ class Category:
         for child, joint in enumerate(self.joints, start=1):
             if not 0 <= joint.parent < child:
                 raise CaperError(f"{where}: part {child} must come after its parent {joint.parent}")
-            if not joint.limits[0] < joint.limits[1]:
-                raise CaperError(f"{where}: joint of part {child} has empty limits {joint.limits}")
+            if joint.type not in get_args(JointType):
+                wrong = unknown_name("joint type", joint.type, get_args(JointType))
+                raise CaperError(f"{where}: {wrong}")
+            if not -np.inf < joint.limits[0] < joint.limits[1] < np.inf:
+                raise CaperError(
+                    f"{where}: joint of part {child} must have finite limits, the low one first, "
+                    f"got {joint.limits}"
+                )
+        if not set(self.directions) <= set("xyz") or len(self.directions) != 2:
+            raise CaperError(f"{where}: directions are two of x, y, z, got {self.directions}")
         if self.directions[0] == self.directions[1]:
             raise CaperError(f"{where}: the two directions must differ, got {self.directions}")
         for label, rows in (("mean_size", self.mean_size), ("mean_center", self.mean_center)):
             if np.shape(rows) != (len(self.parts), 3):
                 raise CaperError(f"{where}: {label} must be [{len(self.parts)}, 3]")
+            if not np.isfinite(rows).all():
+                raise CaperError(f"{where}: {label} must be finite")
+        if not 0 < self.unit < np.inf or np.min(self.mean_size) <= 0:
+            raise CaperError(f"{where}: unit and mean_size must be positive")
+        if self.closed not in ("low", "high", None):
+            raise CaperError(f"{where}: closed is 'low', 'high' or None, got {self.closed!r}")
+        for equivalence in self.equivalences:
+            turn = np.array(equivalence.turn, float)
+            if sorted(equivalence.permutation) != list(range(len(self.parts))):
+                raise CaperError(
+                    f"{where}: an equivalence must permute the parts, got {equivalence.permutation}"
+                )
+            is_rotation = turn.shape == (3, 3) and np.allclose(turn @ turn.T, np.eye(3), atol=1e-5)
+            if not is_rotation or np.linalg.det(turn) < 0:
+                raise CaperError(f"{where}: the turn of an equivalence is not a rotation: {turn}")

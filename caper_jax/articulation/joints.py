@@ -85,7 +85,7 @@ def joint_transforms(
     turns = np.array([name == "revolute" for name in joint_types], dtype=bool)
     count = len(turns)
     u = unit(as_floating(axis, (count, 3), "axis"))
-    q = as_floating(pivot, (count, 3), "pivot")
+    q = jnp.where(turns[:, None], as_floating(pivot, (count, 3), "pivot"), 0.0)
     state = as_floating(state, (count,), "state")
     angle, slide = jnp.where(turns, state, 0.0), jnp.where(turns, 0.0, state)
 

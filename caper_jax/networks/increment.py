@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from caper_jax.geometry import se3
+from caper_jax.geometry.directions import rotation_from_directions
 from caper_jax.networks.caper import IncrementKind
 
 
@@ -14,16 +15,16 @@ def increment_transform(numbers, kind: IncrementKind) -> jax.Array:
 
     Args:
       numbers: "lie": [..., 6] a twist (w, rho), mapped by the exponential (Eq 14); "euclidean":
-        [..., 9] the first two axes, as differences to x and y, and the translation, made a
-        rotation by Gram-Schmidt. Zeros give the identity in both.
+        [..., 9] the first two axes, as differences to x and y, and the translation; the first axis
+        keeps its direction, the second is made perpendicular. Zeros give the identity in both.
       kind: which of the two.
     """
     if kind == "lie":
         return se3.exp(numbers)
-    x = _unit(numbers[..., 0:3] + jnp.array([1.0, 0.0, 0.0], numbers.dtype))
+    x = numbers[..., 0:3] + jnp.array([1.0, 0.0, 0.0], numbers.dtype)
     y = numbers[..., 3:6] + jnp.array([0.0, 1.0, 0.0], numbers.dtype)
-    y = _unit(y - (x * y).sum(-1, keepdims=True) * x)
-    return se3.from_rt(jnp.stack([x, y, jnp.cross(x, y)], -1), numbers[..., 6:])
+    rotation, _ = rotation_from_directions(x, y, 1.0, 0.0, ("x", "y"))
+    return se3.from_rt(rotation, numbers[..., 6:])
 
 
 def increment_numbers(transform, kind: IncrementKind) -> jax.Array:
@@ -33,10 +34,3 @@ def increment_numbers(transform, kind: IncrementKind) -> jax.Array:
     axes = transform[..., :3, :2] - jnp.eye(3, dtype=transform.dtype)[:, :2]
     axes = jnp.swapaxes(axes, -1, -2)
     return jnp.concatenate([axes[..., 0, :], axes[..., 1, :], transform[..., :3, 3]], -1)
-
-
-def _unit(vector):
-    """Vectors over their length; zero stays zero, with finite slopes."""
-    squared = (vector * vector).sum(-1, keepdims=True)
-    positive = squared > 1e-12
-    return jnp.where(positive, vector * jax.lax.rsqrt(jnp.where(positive, squared, 1.0)), 0.0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-
 from caper_jax.networks.heads import unit_vectors
 
 
@@ -22,7 +20,8 @@ def vote(points, heatmap, offset, direction):
     Returns:
       axis [B, J, 3] unit vectors and pivot [B, J, 3].
     """
-    share = heatmap / jnp.maximum(heatmap.sum(axis=1, keepdims=True), 1e-6)
+    weight = heatmap + 1e-9  # where no point has any, all have the same
+    share = weight / weight.sum(axis=1, keepdims=True)
     pivot = (share[..., None] * (points[:, :, None, :] + offset)).sum(axis=1)
     axis = (share[..., None] * direction).sum(axis=1)
     return unit_vectors(axis), pivot

@@ -19,7 +19,7 @@ from caper_jax.networks.increment import increment_transform
 from caper_jax.networks.turns import NUM_TURNS, log_odds
 from caper_jax.networks.voting import vote
 from caper_jax.tracking.registration import Tree, part_poses
-from caper_jax.tracking.state import Constants
+from caper_jax.tracking.state import Constants, of_type
 
 _NO_TURN = np.zeros(NUM_TURNS, np.float32)
 _MEMORY = 60.0  # frames over which joint parameters and sizes are averaged
@@ -81,7 +81,7 @@ def measure(
         known=jnp.zeros(category.num_joints),
     )
     tree = Tree(axis[0], pivot[0], category.joint_types, category.parents)
-    return Fix(
+    fix = Fix(
         root=se3.compose(reference, increment),
         joint_state=output.state[0],
         parts=part_poses(tree, output.state[0]),
@@ -90,6 +90,7 @@ def measure(
         sure=jnp.asarray(1.0, points.dtype),
         turn=_NO_TURN if output.turn is None else log_odds(output.turn[0]),
     )
+    return of_type(fix, points.dtype)
 
 
 def estimate_fix(variables, points, labels, category: Category, network: NetworkConfig) -> Fix:
@@ -98,7 +99,7 @@ def estimate_fix(variables, points, labels, category: Category, network: Network
     prediction = estimate(variables, points[None] / unit, category, network)
     pose = jax.tree.map(lambda array: array[0], prediction.pose)
     poses = se3.from_rt(pose.rotation, pose.translation * unit)
-    return Fix(
+    fix = Fix(
         root=poses[0],
         joint_state=pose.joint_state * category.state_units,
         parts=se3.compose(se3.inverse(poses[0]), poses),
@@ -114,6 +115,7 @@ def estimate_fix(variables, points, labels, category: Category, network: Network
         sure=prediction.confidence[0].min(),
         turn=_NO_TURN,
     )
+    return of_type(fix, points.dtype)
 
 
 def averaged(old: Constants, new: Constants) -> Constants:

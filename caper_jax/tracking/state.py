@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import flax.struct
+import jax
+import jax.numpy as jnp
 
 from caper_jax.tracking.registration import Surface
 
@@ -104,3 +106,13 @@ class TrackerState:
     vote: Any
     trial: Any
     lost: Any
+
+
+def of_type(tree, dtype):
+    """A pytree with its floating-point leaves in one dtype: 64-bit JAX mixes them otherwise."""
+
+    def cast(leaf):
+        leaf = jnp.asarray(leaf)
+        return leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+    return jax.tree.map(cast, tree)

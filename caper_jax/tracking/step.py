@@ -41,7 +41,7 @@ from caper_jax.tracking.registration import (
     mismatch,
     register,
 )
-from caper_jax.tracking.state import Constants, Keyframe, Observation, TrackerState
+from caper_jax.tracking.state import Constants, Keyframe, Observation, TrackerState, of_type
 
 _ACCEPTED = 1.3  # how much worse than an accepted misfit contradicts again
 _GIVEN = 60.0  # nats against a turn of a pose that the user gave
@@ -137,7 +137,7 @@ def given_state(
     states, constants = joints_from_poses(parts, found.constants, category)
     fix = replace(found, root=root, parts=parts, joint_state=states, constants=constants)
     begin = initial_state(category, network, config)
-    return replace(
+    after = replace(
         begin,
         root=root,
         joint_state=fix.joint_state,
@@ -149,6 +149,7 @@ def given_state(
         vote=begin.vote - _GIVEN,
         lost=jnp.asarray(False),
     )
+    return of_type(after, begin.root.dtype)
 
 
 def track_step(
@@ -193,6 +194,7 @@ def _track_step(
     # A frame without points runs through the same arithmetic, on points where the object was.
     stand_in = se3.act(state.root, key.points) + jnp.array([0.0, 0.0, 1e-3])
     points = jnp.where(frame.present, frame.points * category.unit, stand_in)
+    points = points.astype(state.root.dtype)
 
     predicted = (
         se3.compose(state.root, se3.exp(config.damping * state.root_velocity)),
@@ -288,6 +290,7 @@ def _track_step(
         trial=jnp.where(replaced, config.trial, left).astype(jnp.int32),
         lost=jnp.asarray(False),
     )
+    after = of_type(after, state.root.dtype)
     held = replace(
         state,
         root_velocity=jnp.zeros_like(state.root_velocity),
