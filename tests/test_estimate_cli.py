@@ -92,7 +92,9 @@ def test_pose_is_printed_and_written(files, seen, capsys):
     assert f"{np.degrees(pose.joint_state[0]):.1f}°" in table
     assert " ".join(f"{value:.3f}" for value in pose.translation[1]) in table
     assert "1999 points, 1 dropped" in table
+    assert "confidence in the root's axes (0 to 1): x 0.75, z 0.50" in table
     assert "lid: standard deviation 2.5 deg, 6 mm" in table
+    assert "base – lid: standard deviation 3.0°" in table
     assert "lid: hidden (3 points), known through its joint alone" in table
     assert max(map(len, table.splitlines())) <= 80
 

@@ -82,9 +82,9 @@ def drawer(tmp_path_factory):
 def test_a_process_without_the_package_finds_the_same(drawer, tmp_path):
     estimator, folder = drawer
     moved = shutil.copytree(folder, tmp_path / "elsewhere")
-    cloud = clouds(1, 150)[0]
-    cloud[3], cloud[7] = np.nan, 0.0
-    np.save(tmp_path / "cloud.npy", cloud)
+    both = clouds(2, 150)  # one after the other: the model takes one at a time
+    both[:, 3], both[:, 7] = np.nan, 0.0
+    np.save(tmp_path / "cloud.npy", both)
     files = [str(moved / "run.py"), str(tmp_path / "cloud.npy"), str(tmp_path / "poses.npz")]
     quick = {**os.environ, "XLA_FLAGS": "--xla_backend_optimization_level=0"}
     done = subprocess.run(
@@ -96,8 +96,9 @@ def test_a_process_without_the_package_finds_the_same(drawer, tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    points = sample_points(cloud, 64).points[None]
-    expected = quick_jit(estimator.function)(estimator.variables, points)
+    function = quick_jit(estimator.function)
+    alone = [function(estimator.variables, sample_points(c, 64).points[None]) for c in both]
+    expected = jax.tree.map(lambda *rows: np.concatenate(rows), *alone)
     with np.load(tmp_path / "poses.npz") as found:
         assert_same(found, expected, rtol=0, atol=1e-5)
 
@@ -162,10 +163,17 @@ def test_the_encoder_of_the_paper_on_every_platform(tmp_path):
 def test_the_runner_is_short_and_refuses_clouds_of_few_points(drawer):
     _, folder = drawer
     code = [line for line in (folder / "run.py").read_text().splitlines() if line.strip()]
-    assert len(code) <= 29  # four of them are its docstring
+    assert len(code) <= 30  # three of them are its docstring
     runner = runpy.run_path(str(folder / "run.py"))
     with pytest.raises(AssertionError, match="only 15 usable points"):
         runner["sample"](clouds(1)[0, :15])
+
+
+def test_the_runner_says_how_it_is_used(drawer, monkeypatch):
+    _, folder = drawer
+    monkeypatch.setattr("sys.argv", ["run.py"])
+    with pytest.raises(SystemExit, match=r"python run.py cloud.npy poses.npz: "):
+        runpy.run_path(str(folder / "run.py"), run_name="__main__")
 
 
 def test_the_runner_picks_the_points_that_the_package_picks(drawer):

@@ -96,18 +96,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     estimator = load(category.name, arguments.weights, arguments.object_scale)
     prediction = estimator(observation.cloud.points[None])
     prediction = jax.tree.map(lambda array: np.asarray(array)[0], prediction)
-    pose, confidence = prediction.pose, prediction.confidence
+    pose = prediction.pose
     if not all(np.isfinite(value).all() for value in vars(pose).values()):
         raise CaperError("the model gave no finite pose for this object; check mask and units")
 
     cloud = observation.cloud
     scene = _scene(arguments, category, observation, prediction)
     print(format_scene(scene))
-    print(
-        f"confidence {' '.join(f'{value:.2f}' for value in confidence)}; {cloud.available} points, "
-        f"{cloud.dropped} dropped"
-    )
-    print(_deviations(prediction, category), end="")
+    print(f"{cloud.available} points, {cloud.dropped} dropped")
+    print(_certainty(prediction, category), end="")
     if prediction.degenerate:
         print("the rotation is arbitrary: the two directions that give it are parallel")
     if arguments.json is not None:
@@ -181,16 +178,22 @@ def _state(pose: ArticulatedPose, category: Category, joint: int) -> tuple[float
     return value, "metres"
 
 
-def _deviations(prediction: Prediction, category: Category) -> str:
+def _certainty(prediction: Prediction, category: Category) -> str:
     """Lines on how sure the model is, and on parts that are known through their joints alone."""
     from caper_jax.confidence import HIDDEN_POINTS
+    from caper_jax.visualization.scene import format_state, joint_name
 
-    lines = []
+    axes = zip(category.directions, prediction.confidence, strict=True)
+    found = ", ".join(f"{axis} {value:.2f}" for axis, value in axes)
+    lines = [f"confidence in the root's axes (0 to 1): {found}"]
     if prediction.rotation_std is not None:
         for k, name in enumerate(category.parts):
             turn = np.degrees(prediction.rotation_std[k])
             shift = 1000 * prediction.translation_std[k]
             lines.append(f"{name}: standard deviation {turn:.1f} deg, {shift:.0f} mm")
+        for j, kind in enumerate(category.joint_types):
+            state = format_state(float(prediction.state_std[j]), kind)
+            lines.append(f"{joint_name(category, j)}: standard deviation {state}")
     for name, count in zip(category.parts, prediction.seen, strict=True):
         if count < HIDDEN_POINTS:
             lines.append(f"{name}: hidden ({count} points), known through its joint alone")

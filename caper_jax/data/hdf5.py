@@ -118,7 +118,9 @@ def check_writable(path: str | Path, overwrite: bool = False) -> None:
     if path.is_dir():
         raise CaperError(f"{path}: is a folder, give the name of a file")
     if path.exists() and not overwrite:
-        raise CaperError(f"{path}: exists already; choose another name or ask to overwrite")
+        raise CaperError(
+            f"{path}: exists already; choose another name or overwrite it (--overwrite)"
+        )
     if not path.parent.is_dir():
         raise CaperError(f"{path}: the folder {path.parent} does not exist")
     if not os.access(path.parent, os.W_OK):

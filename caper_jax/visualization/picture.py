@@ -34,6 +34,7 @@ from caper_jax.visualization.scene import (
 )
 
 TITLES = ("Depth image and mask", "Estimate over the depth image", "Seen from another side")
+CLOUD_TITLES = ("Points by distance", "Estimate over the points", TITLES[2])
 DPI = 110
 ROW_HEIGHT = 3.9  # inches
 WIDTHS = (3.4, 3.4, 3.4, 4.3)  # inches: three views and the legend
@@ -75,7 +76,8 @@ def write_picture(path: str | Path, scenes: Sequence[Scene]) -> Path:
         _draw_side(axes[2], scene)
         _draw_legend(axes[3], scene)
         if row == 0:
-            for axis, title in zip(axes, TITLES, strict=False):
+            titles = CLOUD_TITLES if all(s.depth is None for s in scenes) else TITLES
+            for axis, title in zip(axes, titles, strict=False):
                 axis.set_title(title, fontsize=12, color=INK, pad=8)
     return save_figure(figure, path, dpi=DPI, facecolor="white")
 

@@ -1,8 +1,7 @@
 """python run.py cloud.npy poses.npz: poses from a cloud [N, 3] or a batch [B, N, 3], in metres.
 
 Camera frame: x right, y down, z forward. Needs jax and numpy, nothing else. manifest.json says
-what comes out. In a program: ``from run import estimate, sample``.
-"""
+what comes out. In a program: ``from run import estimate, sample``."""
 
 import json
 import sys
@@ -10,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jax import ShapeDtypeStruct, export, jit, lax
+from jax import ShapeDtypeStruct, export, jit, lax, tree
 
 MANIFEST = json.loads(Path(__file__).with_name("manifest.json").read_text("utf-8"))
 SHAPE, OUTPUTS = MANIFEST["inputs"]["points"]["shape"], MANIFEST["outputs"]
@@ -36,5 +35,7 @@ model = Path(__file__).with_name("model.stablehlo").read_bytes()
 estimate = jit(replace(outlined, mlir_module_serialized=model, **MANIFEST["convention"]).call)
 
 if __name__ == "__main__":
-    clouds = np.array(np.load(sys.argv[1]), np.float32, ndmin=3)
-    np.savez(sys.argv[2], **estimate(np.stack([sample(cloud) for cloud in clouds])))
+    source, target = sys.argv[1:] if len(sys.argv) == 3 else sys.exit(__doc__)
+    clouds = np.stack([sample(cloud) for cloud in np.array(np.load(source), np.float32, ndmin=3)])
+    batches = clouds[:, None] if SHAPE[0] == 1 else clouds[None]
+    np.savez(target, **tree.map(lambda *rows: np.concatenate(rows), *map(estimate, batches)))
