@@ -77,7 +77,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--split", help="split of --data (default: train)")
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument(
-        "--minutes", type=common.positive_float, help="length of the run in minutes"
+        "--minutes",
+        type=common.positive_float,
+        help="length of the run in minutes (default: the configuration's, or 60)",
     )
     budget.add_argument(
         "--steps", type=common.positive_int, help="length in steps: reproducible to the bit"
