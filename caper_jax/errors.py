@@ -37,3 +37,11 @@ def check_least(section: str, config: Any, **bounds: float) -> None:
         numbers = value if isinstance(value, tuple) else (value,)
         if not all(low <= number < math.inf for number in numbers):
             raise CaperError(f"{section}.{name} must be at least {low}, got {value}")
+
+
+def check_fractions(section: str, config: Any, names: Iterable[str]) -> None:
+    """CaperError for a number of a configuration, of these names, that is not in [0, 1]."""
+    for name in names:
+        value = getattr(config, name)
+        if not 0.0 <= value <= 1.0:
+            raise CaperError(f"{section}.{name} is a fraction from 0 to 1, got {value}")

@@ -12,7 +12,7 @@ import numpy as np
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.equivalence import is_ambiguous, second_labels, second_reading
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.errors import CaperError, check_least
+from caper_jax.errors import check_fractions, check_least
 from caper_jax.geometry import se3, so3
 from caper_jax.geometry.directions import rotation_from_directions
 from caper_jax.geometry.scan import in_order, scan_order
@@ -68,11 +68,7 @@ class LossConfig:
     def __post_init__(self) -> None:
         noise = {"state_penalty": 0, "root_noise_deg": 0, "root_noise": 0, "root_noise_spread": 1}
         check_least("loss", self, **noise)
-        for name in ("predicted_root", "turned"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise CaperError(
-                    f"loss.{name} is a fraction from 0 to 1, got {getattr(self, name)}"
-                )
+        check_fractions("loss", self, ("predicted_root", "turned"))
 
 
 class Task:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from caper_jax.data.synthetic.masks import OCCLUDERS
 from caper_jax.data.synthetic.sensor import PRESETS
-from caper_jax.errors import CaperError, check_least, unknown_name
+from caper_jax.errors import CaperError, check_fractions, check_least, unknown_name
 
 _FRACTIONS = (
     "occlusion", "erosion", "table", "clutter", "spill", "residue", "dropout", "holes",
@@ -64,11 +64,7 @@ class GeneratorConfig:
 
     def __post_init__(self) -> None:
         check_least("data", self, **LEAST)
-        for name in _FRACTIONS:
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise CaperError(
-                    f"data.{name} is a fraction from 0 to 1, got {getattr(self, name)}"
-                )
+        check_fractions("data", self, _FRACTIONS)
         if not 0.0 <= self.depth_scale <= 0.1:
             raise CaperError(
                 f"data.depth_scale is a relative error from 0 to 0.1, got {self.depth_scale}"
