@@ -102,7 +102,7 @@ def test_a_labelled_file(files, scripted, capsys):
     output = capsys.readouterr().out
     assert max(map(len, output.splitlines())) <= 80
     assert "box: 2 videos, 10 frames" in output
-    assert "start: truth; keyframes: dynamic, energy above" in output
+    assert "start: truth; keyframes: dynamic, energy above 0.03 or 12 % unseen" in output
     assert "object masks: simulated; part masks: predicted" in output
     out = files / "a" / "b"
     names = [stem + end for stem in ("00003", "00007") for end in (".jsonl", ".png", "_states.png")]

@@ -147,12 +147,15 @@ def _count(number: int, thing: str) -> str:
 
 
 def _describe(config: TrackerConfig) -> str:
-    """The policy with the setting that it heeds."""
+    """The policy with the settings that it heeds."""
     if config.policy == "fixed":
         return f"fixed, every {config.interval} frames"
     if config.policy == "none":
         return "none"
-    return f"{config.policy}, energy above {config.threshold:g}"
+    described = f"{config.policy}, energy above {config.threshold:g}"
+    if config.unseen < 1.0:
+        described += f" or {100 * config.unseen:.0f} % unseen"
+    return described
 
 
 def _shortened(name: str) -> str:
