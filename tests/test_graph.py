@@ -238,6 +238,20 @@ def test_directional_max_and_its_gradients(surface, neighbours):
             np.testing.assert_allclose(*slopes, rtol=1e-6)
 
 
+def test_slopes_have_the_types_of_what_they_belong_to():
+    """Under 64-bit JAX points may be finer than weights."""
+    rng = np.random.default_rng(0)
+    index = rng.integers(0, 6, (2, 5, 4))
+    direction = rng.normal(size=(2, 5, 4, 3))
+    features, weights = (rng.normal(size=s).astype(np.float32) for s in ((2, 6, 7), (3, 7)))
+    with jax.enable_x64(True):
+        slopes = jax.grad(
+            lambda d, f, w: directional_max(d, index, f, w).sum() + (f * w[0] * w[0]).sum(),
+            (0, 1, 2),
+        )(*map(jnp.asarray, (direction, features, weights)))
+    assert [slope.dtype for slope in slopes] == [np.float64, np.float32, np.float32]
+
+
 def test_directional_max_with_the_most_neighbours():
     """The winner's number is a uint8: the 256th neighbour still counts."""
     direction = np.tile(np.float32([0, 0, 0.5]), (1, 1, 256, 1))

@@ -187,7 +187,7 @@ def _directional_max_backward(residuals, cotangent):
             return jnp.zeros(size, value.dtype).at[at].add(value, mode="promise_in_bounds")
 
         d_features = jax.vmap(scatter)(flat, (active * theta).reshape(batch, -1))
-        d_features = d_features.reshape(features.shape)
+        d_features = d_features.reshape(features.shape).astype(features.dtype)
         won = gather(features.reshape(batch, -1), flat).reshape(active.shape)
         d_theta = active * won
     d_weights = jnp.stack([(d_theta * axis).sum((0, 1)) for axis in (x, y, z)])
@@ -198,7 +198,8 @@ def _directional_max_backward(residuals, cotangent):
         return None, jnp.einsum("bnc,ic->bni", share, weights, precision="highest")
 
     _, d_direction = lax.scan(toward_points, None, per_neighbour)
-    return jnp.moveaxis(d_direction, 0, 2), None, d_features, d_weights
+    d_direction = jnp.moveaxis(d_direction, 0, 2).astype(direction.dtype)
+    return d_direction, None, d_features, d_weights.astype(weights.dtype)
 
 
 directional_max.defvjp(_directional_max_forward, _directional_max_backward)
