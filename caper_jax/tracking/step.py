@@ -90,7 +90,7 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
         labels=jnp.zeros(points, jnp.int32),
         age=jnp.asarray(0, jnp.int32),
     )
-    return TrackerState(
+    state = TrackerState(
         root=eye.at[2, 3].set(category.unit),
         joint_state=jnp.zeros(joints),
         parts=keyframe.parts,
@@ -107,6 +107,7 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
         trial=jnp.asarray(0, jnp.int32),
         lost=jnp.asarray(True),
     )
+    return of_type(state, eye.dtype)
 
 
 def given_state(
