@@ -212,13 +212,13 @@ def _assign(values: dict[str, Any], cls: type, assignment: str) -> None:
             raise CaperError(f"override {assignment!r}: there is no {prefix[:-1]} in this run")
         values = values.setdefault(section, {})
     kind = _field_type(cls, name, prefix, assignment)
-    if dataclasses.is_dataclass(_without_none(kind)):
+    optional = type(None) in typing.get_args(kind)
+    if dataclasses.is_dataclass(_without_none(kind)) and not (optional and text.lower() == "none"):
         raise CaperError(f"override {assignment!r}: {key} is a section; name a key in it")
     try:
         values[name] = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         values[name] = text  # a string without quotes, or a mistake that the type check names
-    optional = type(None) in typing.get_args(kind)
     if optional and text.lower() == "none":
         values[name] = None
     elif not isinstance(values[name], str) and _holds_only_strings(kind):

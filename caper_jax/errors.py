@@ -25,7 +25,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> CaperError:
 
 
 def check_least(section: str, config: Any, **bounds: float) -> None:
-    """CaperError for a number of a configuration that is below its bound, or not finite.
+    """CaperError for a number of a configuration that is below its bound or not finite, or none.
 
     Args:
       section: where a configuration file has it, for the message.
@@ -35,8 +35,11 @@ def check_least(section: str, config: Any, **bounds: float) -> None:
     for name, low in bounds.items():
         value = getattr(config, name)
         numbers = value if isinstance(value, tuple) else (value,)
+        if not numbers:
+            raise CaperError(f"{section}.{name} must not be empty")
         if not all(low <= number < math.inf for number in numbers):
-            raise CaperError(f"{section}.{name} must be at least {low}, got {value}")
+            kind = "finite and " if math.inf in numbers else ""
+            raise CaperError(f"{section}.{name} must be {kind}at least {low}, got {value}")
 
 
 def check_fractions(section: str, config: Any, names: Iterable[str]) -> None:

@@ -155,6 +155,7 @@ def test_a_section_that_may_be_absent(tmp_path):
     assert configuration.override(got, "layers.box=[1, 2]").layers == Layers(5, box=(1.0, 2.0))
     with pytest.raises(CaperError, match="layers is a section"):
         configuration.override(got, "layers=1")
+    assert configuration.override(got, "layers=none") == Optional()
     with pytest.raises(CaperError, match=r"'layers.width=3': there is no layers in this run"):
         configuration.override(Optional(), "layers.width=3")
 

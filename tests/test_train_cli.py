@@ -85,9 +85,18 @@ def test_a_run_that_ended_leaves_its_model_as_it_is(model, monkeypatch):
     again = ["train", *TINY, "--steps", "10", "--out", str(model)]
     assert cli.main(again) == 0
     assert read_model(model)[0] == mine
-    write_card(model, {**mine, "complete": False})
+    write_card(model, {**mine, "complete": None})
     assert cli.main(again) == 0
     assert read_model(model)[0] == card
+
+
+def test_a_run_replaces_the_model_of_another_run(model, tmp_path):
+    for name in ("weights.npz", "model.json"):  # complete, and of as many steps
+        shutil.copy(model / name, tmp_path)
+    other = ["train", *TINY, "--steps", "10", "--seed", "3", "--out", str(tmp_path)]
+    assert cli.main(other) == 0
+    card, first = read_model(tmp_path)[0], read_model(model)[0]
+    assert card["run"]["training"]["seed"] == 3 and card["complete"] != first["complete"]
 
 
 def test_settings_of_the_loader_stand_beside_data(tmp_path, monkeypatch, capsys):
@@ -275,6 +284,12 @@ def test_every_configuration_file_is_valid(name):
         ("sides_frames=500", "fitting sides needs 1024 frames or more, got 500"),
         ("network.fast.width=0", "network.fast.width must be at least 1, got 0"),
         ("network.fast.scales=[0.1, 0.0]", "network.fast.scales must be at least 0.001"),
+        ("network.fast.scales=[]", "network.fast.scales must not be empty"),
+        ("network.turn_margin=nan", "network.turn_margin must be at least 0, got nan"),
+        ("network.point_heads.dropout=1.0", "network.point_heads.dropout must be below 1, got 1.0"),
+        ("network.root_heads.widths=[0,1,1]", "network.root_heads.widths must be at least 1"),
+        ("network.point_stride=200", "network.point_stride must be at most network.num_points"),
+        ("loss.state_penalty=inf", "loss.state_penalty must be finite and at least 0, got inf"),
         ("network.turn_width=-1", "network.turn_width must be at least 0, got -1"),
         ("loss.weights.twist=-1", "loss.weights.twist must be at least 0, got -1.0"),
         ("loss.root_noise=nan", "loss.root_noise must be at least 0, got nan"),

@@ -73,8 +73,10 @@ def build_parser() -> argparse.ArgumentParser:
         type=Path,
         help="a dataset's folder or .h5 file to train on instead of generated frames",
     )
-    parser.add_argument("--format", help="layout of --data (default: caper)")
-    parser.add_argument("--split", help="split of --data (default: train)")
+    parser.add_argument(
+        "--format", help="layout of --data (default: the configuration's, or caper)"
+    )
+    parser.add_argument("--split", help="split of --data (default: the configuration's, or train)")
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument(
         "--minutes",

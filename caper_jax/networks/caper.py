@@ -10,7 +10,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from caper_jax.errors import check_least
+from caper_jax.errors import CaperError, check_least
 from caper_jax.networks.fast_encoder import FastEncoder, FastEncoderConfig
 from caper_jax.networks.heads import HeadConfig, PointHead, PooledHead, unit_vectors
 from caper_jax.networks.hs_encoder import (
@@ -81,12 +81,22 @@ class NetworkConfig:
             self,
             corrections=0,
             turn_width=0,
-            turn_margin=0,
             sides_width=0,
             sides_passes=1,
             num_points=1,
             point_stride=1,
         )
+        if not self.turn_margin >= 0.0:  # without end: it never turns
+            raise CaperError(f"network.turn_margin must be at least 0, got {self.turn_margin}")
+        for name in ("root_heads", "pooled_heads", "point_heads"):
+            getattr(self, name).check(f"network.{name}")
+        strides = {"point_stride": self.point_stride, "fast.stride": self.fast.stride}
+        for name, stride in strides.items():
+            if stride > self.num_points:
+                raise CaperError(
+                    f"network.{name} must be at most network.num_points = {self.num_points}, "
+                    f"got {stride}"
+                )
 
 
 def make_encoder(config: NetworkConfig) -> nn.Module:

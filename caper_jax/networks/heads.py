@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import flax.linen as nn
 import jax.numpy as jnp
 
-from caper_jax.errors import check_least
+from caper_jax.errors import CaperError, check_least
 from caper_jax.networks.features import BlockDense, Features
 from caper_jax.networks.layers import (
     BatchNorm,
@@ -34,8 +34,11 @@ class HeadConfig:
     dropout: float = 0.2
     pool_first: bool = False
 
-    def __post_init__(self) -> None:
-        check_least("heads", self, widths=1, dropout=0)
+    def check(self, section: str) -> None:
+        """CaperError for sizes that are out of range; ``section`` is where a file has them."""
+        check_least(section, self, widths=1, dropout=0)
+        if self.dropout >= 1.0:
+            raise CaperError(f"{section}.dropout must be below 1, got {self.dropout}")
 
 
 def _norm_relu(features, train: bool):

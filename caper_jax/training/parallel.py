@@ -38,13 +38,7 @@ def initialize(coordinator: str, num_processes: int, process_id: int) -> None:
     # Collectives between processes on CPU; without effect on accelerators.
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
-        jax.distributed.initialize(
-            coordinator,
-            num_processes,
-            process_id,
-            # The others wait while the first fits sides and confidence at the end of a run.
-            shutdown_timeout_seconds=24 * 3600,
-        )
+        jax.distributed.initialize(coordinator, num_processes, process_id)
     except (RuntimeError, ValueError) as error:
         raise CaperError(
             f"process {process_id} of {num_processes} cannot join {coordinator}: {error}"

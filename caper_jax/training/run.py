@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import platform
 import sys
@@ -41,6 +42,7 @@ from caper_jax.training.calibration import FRAMES, calibrate
 from caper_jax.training.calibration import check_frames as check_calibration
 from caper_jax.training.loop import FitResult, TrainingConfig, fit
 from caper_jax.training.losses import LossWeights
+from caper_jax.training.run_directory import FILE as CONFIG_FILE
 from caper_jax.training.task import LossConfig, Task
 
 _SAMPLE = 512  # frames that give the trivial predictor of the model card
@@ -196,7 +198,9 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         write_model(directory, trained, card)
         if config.loader is None:  # of the weights as they are stored, and once they are
             _finish(config, directory)
-        write_card(directory, {**read_card(directory), "complete": True})
+        write_card(directory, {**read_card(directory), "complete": _digest(directory)})
+    # The others wait: one that ends takes the run with it after some minutes.
+    parallel.agree([0.0])
     return result
 
 
@@ -205,7 +209,13 @@ def _complete(directory: str | Path, result: FitResult) -> bool:
     if not all((Path(directory) / name).is_file() for name in (CARD_FILE, WEIGHTS_FILE)):
         return False
     card = read_card(directory)
-    return bool(card.get("complete")) and card.get("steps") == int(result.state.step)
+    run = card.get("complete"), card.get("steps")
+    return run == (_digest(directory), int(result.state.step))
+
+
+def _digest(directory: str | Path) -> str:
+    """Tells the run of a directory from others, by its configuration."""
+    return hashlib.sha256((Path(directory) / CONFIG_FILE).read_bytes()).hexdigest()[:16]
 
 
 def _finish(config: RunConfig, directory: str | Path) -> None:

@@ -11,6 +11,7 @@ import jax
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
 
+FILE = "config.json"
 # Keys of the configuration that a resumed run may change: they do not touch the result.
 _FREE_KEYS = frozenset(
     {
@@ -34,7 +35,7 @@ def check_configuration(directory: Path, configuration: dict[str, Any]) -> None:
     Raises:
       CaperError: the directory is of a run with another configuration; names what differs.
     """
-    path = directory / "config.json"
+    path = directory / FILE
     text = json.dumps(configuration, indent=2, sort_keys=True)
     if path.exists():
         try:

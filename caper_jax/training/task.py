@@ -146,15 +146,17 @@ class Task:
         canonical = canonicalise(points, reference[:, :3, :3], reference[:, :3, 3])
         parts, parts_state = self._apply("parts", params["parts"], model_state, canonical, keys[2])
         stride = self.network.point_stride
-        parts_losses, metrics = self._parts_losses(
-            canonical[:, ::stride], parts, truth, labels[:, ::stride]
-        )
+        labels = labels[:, ::stride]
+        parts_losses, metrics = self._parts_losses(canonical[:, ::stride], parts, truth, labels)
         # Seen from a turned reference, everything else would have to be said twice.
         right = (turn == 0).astype(canonical.dtype)
         metrics |= parts_losses
         metrics = {
             name: (v * right).sum() / jnp.maximum(right.sum(), 1.0) for name, v in metrics.items()
         }
+        known = (labels >= 0) * right[:, None]
+        found = parts.segmentation.argmax(-1) == labels
+        metrics["segmentation_accuracy"] = (found * known).sum() / jnp.maximum(known.sum(), 1.0)
         if self.network.turn_width:
             parts_losses = {name: value * right for name, value in parts_losses.items()}
             parts_losses["turn"] = losses.turn_loss(parts.turn, turn)
@@ -325,9 +327,8 @@ class Task:
             del parts["heatmap"], parts["offset"]
             # Not of unit length: from an axis that points the other way no gradient leads back.
             parts["direction"] = losses.direction_loss(output.direction[:, 0], truth.joint_axis)
-        right = (output.segmentation.argmax(-1) == labels).sum(-1)
         off = jnp.abs(output.state - truth.joint_state)
-        metrics = {"segmentation_accuracy": right / jnp.maximum((labels >= 0).sum(-1), 1)}
+        metrics = {}
         for number, kind in enumerate(self.category.joint_types):
             name, factor = ("deg", 180 / np.pi) if kind == "revolute" else ("unit", 1.0)
             metrics[f"state{number + 1}_{name}"] = off[:, number] * factor
