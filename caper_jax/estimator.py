@@ -74,7 +74,7 @@ def estimate(
     Args:
       variables: {"params": {"root", "parts"}, "batch_stats": {...}} as trained; with
         ``network.sides_width`` also "sides" among "params".
-      points: [B, N, 3] metres, camera frame, finite.
+      points: [B, N, 3] metres, camera frame, finite; half precision is computed with in float32.
       category: static.
       network: static.
       calibration: gives the standard deviations.
@@ -90,6 +90,8 @@ def estimate(
     points = jnp.asarray(points)
     if not jnp.issubdtype(points.dtype, jnp.floating):
         raise CaperError(f"points must be floats, in metres, got {points.dtype}")
+    # Moments of points cancel in half precision, without any NaN.
+    points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
     view = view_rotation(points)
     cloud = rotate(view, points) * category.unit
     found = read(variables, cloud, category, network)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import quick_jit
 from scipy.spatial.transform import Rotation
 from tiny import network, random_like, random_variables
 
@@ -419,3 +420,13 @@ def test_every_category_ships_a_model_with_its_card():
         assert card["category"] == folder.name
         assert {"run", "steps", "training_seconds_in_all", "hardware", "commit"} <= card.keys()
         assert card["metrics"] and card["calibration"]["frames"] >= 2000
+
+
+def test_points_of_half_precision_are_computed_with_in_float32():
+    config = network("fast", pool_first=True)
+    variables = random_variables(BOX, config)
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (1, 64, 3)) + [0.0, 0.0, 0.7]
+    short = jnp.asarray(points, jnp.bfloat16)
+    estimated = quick_jit(lambda cloud: estimate(variables, cloud, BOX, config).pose)
+    found, expected = estimated(short), estimated(short.astype(jnp.float32))
+    jax.tree.map(partial(np.testing.assert_allclose, atol=1e-5), found, expected)
