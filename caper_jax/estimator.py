@@ -109,10 +109,11 @@ def estimate(
     if calibration is None:
         return prediction
     turn, shift, off = confidence.radii(calibration, found.evidence)
+    state_units = jnp.asarray(category.state_units, off.dtype)
     return prediction.replace(  # type: ignore[attr-defined]
         rotation_std=turn / confidence.RADIUS_3D,
         translation_std=shift / confidence.RADIUS_3D / category.unit,
-        state_std=off / confidence.RADIUS_1D / category.state_units,
+        state_std=off / confidence.RADIUS_1D / state_units,
     )
 
 

@@ -85,7 +85,7 @@ def read(variables: dict[str, Any], cloud, category: Category, network: NetworkC
     canonical = canonicalise(cloud, pose[:, :3, :3], pose[:, :3, 3])
     parts = apply("parts", parts_network, canonical)
     axis, pivot = vote(canonical, parts.heatmap, parts.offset, parts.direction)
-    mean_size = jnp.asarray(category.mean_size) * unit
+    mean_size = jnp.asarray(category.mean_size, cloud.dtype) * unit
     moved = se3.log(se3.compose(se3.inverse(uncorrected), pose))
     return Found(
         reading=Reading(
@@ -94,7 +94,7 @@ def read(variables: dict[str, Any], cloud, category: Category, network: NetworkC
             pivot=pivot,
             state=parts.state,
             size=jnp.maximum(mean_size + parts.size, SMALLEST_SIZE * mean_size),
-            center=jnp.asarray(category.mean_center) * unit + parts.center,
+            center=jnp.asarray(category.mean_center, cloud.dtype) * unit + parts.center,
         ),
         segmentation=as_before(parts.segmentation, order),
         confidence=root.confidence,
@@ -139,7 +139,8 @@ def articulated_pose(reading: Reading, view, category: Category) -> ArticulatedP
       category: static.
     """
     unit, back = category.unit, transpose(view)
-    pivot, state = reading.pivot / unit, reading.state / category.state_units
+    state_units = jnp.asarray(category.state_units, reading.state.dtype)
+    pivot, state = reading.pivot / unit, reading.state / state_units
     translation = rotate(back, reading.root[:, None, :3, 3])[:, 0] / unit
     poses = forward_kinematics(
         se3.from_rt(multiply(back, reading.root[:, :3, :3]), translation),

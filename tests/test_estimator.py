@@ -422,6 +422,18 @@ def test_every_category_ships_a_model_with_its_card():
         assert card["metrics"] and card["calibration"]["frames"] >= 2000
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_with_64_bit_jax_an_estimate_is_of_the_type_of_its_points(dtype):
+    box = load("box")
+    with jax.enable_x64(True):
+        found = jax.eval_shape(
+            lambda points: estimate(box.variables, points, BOX, box.network, box.calibration),
+            jax.ShapeDtypeStruct((2, 256, 3), dtype),
+        )
+    kinds = {leaf.dtype for leaf in jax.tree.leaves(found) if leaf.dtype.kind == "f"}
+    assert kinds == {np.dtype(dtype)}
+
+
 def test_points_of_half_precision_are_computed_with_in_float32():
     config = network("fast", pool_first=True)
     variables = random_variables(BOX, config)

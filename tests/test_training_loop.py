@@ -22,6 +22,7 @@ from caper_jax.training import loop
 from caper_jax.training.loop import TrainingConfig, fit
 from caper_jax.training.metrics_log import read_metrics
 from caper_jax.training.optimizer import Optimizer, flat_and_anneal
+from caper_jax.training.run_directory import check_configuration
 from caper_jax.training.state import TrainState, make_step, step_keys
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -255,6 +256,27 @@ def test_a_run_bounded_by_minutes_uses_them_up_over_resumes(tmp_path, monkeypatc
     assert_same_bits(without_clock(again.state), without_clock(last.state))
 
 
+def test_compiling_is_not_training(tmp_path, monkeypatch):
+    clock = Clock(tick=0.25)
+    monkeypatch.setattr(loop, "time", clock)
+
+    def slow_at_first(*arguments, **options):
+        step, called = make_step(*arguments, **options), []
+
+        def call(*arguments):
+            clock.now += 0.0 if called else 100.0
+            called.append(True)
+            return step(*arguments)
+
+        return call
+
+    monkeypatch.setattr(loop, "make_step", slow_at_first)
+    settings = config(steps=None, minutes=0.5)
+    result = fit(tmp_path, settings, loss_fn, variables(), batches=host_batches())
+    assert result.finished and int(result.state.step) > 10
+    assert float(result.state.elapsed) == pytest.approx(30, abs=2)
+
+
 def test_another_configuration_is_refused_by_key(tmp_path, unkilled):
     def resume(settings, description=None):
         return fit(
@@ -271,8 +293,26 @@ def test_another_configuration_is_refused_by_key(tmp_path, unkilled):
     assert "training.seed" in str(e.value) and "batch_size" not in str(e.value)
     with pytest.raises(CaperError, match=r"network.width \('absent' there, 64 now\)"):
         resume(config(), {"network": {"width": 64}})
+    many = {f"setting{i}": i for i in range(20)}
+    with pytest.raises(
+        CaperError, match=r"setting0 \('absent' there, 0 now\), .*, 12 settings more;"
+    ):
+        resume(config(), many)
+    with pytest.raises(CaperError, match=r"started from random weights and this one from a model;"):
+        resume(config(), {"initial": {"steps": 3, "run": many}})
     free = config(checkpoint_minutes=1.0, checkpoint_steps=7, keep_checkpoints=1)
     assert_same_bits(resume(free).state.params, unkilled.state.params)
+
+
+def test_the_model_a_run_started_from_is_told_in_a_word(tmp_path):
+    start = {"initial": {"steps": 3, "run": {"seed": 0}}}
+    check_configuration(tmp_path, {"seed": 1, **start})
+    check_configuration(tmp_path, {"seed": 1, **start})
+    with pytest.raises(CaperError, match=r"configuration: it started from a model and this one fr"):
+        check_configuration(tmp_path, {"seed": 1})
+    other = {"seed": 2, "initial": {"steps": 4, "run": {"seed": 0}}}
+    with pytest.raises(CaperError, match=r"it started from another model, seed \(1 there, 2 now\)"):
+        check_configuration(tmp_path, other)
 
 
 def test_a_broken_configuration_or_metrics_file_is_named(tmp_path):

@@ -28,9 +28,9 @@ def build_parser() -> argparse.ArgumentParser:
         "and median of every error, failed frames included) and predictions.npz (every estimate).",
         [
             ("--category box --data ReArtMix --format reartmix --out outputs/box", "real frames"),
-            ("--category box --data box_test.h5 --format caper --out outputs/box", "generated"),
+            ("--category box --data box_test.h5 --out outputs/box", "generated"),
             (
-                "--category box --data box_test.h5 --format caper --worst 6 --out outputs/box",
+                "--category box --data box_test.h5 --worst 6 --out outputs/box",
                 "see why",
             ),
         ],
@@ -39,7 +39,11 @@ def build_parser() -> argparse.ArgumentParser:
         "--category", required=True, help="e.g. box, or FILE.py:NAME for one of your own"
     )
     parser.add_argument("--data", required=True, type=Path, help="dataset's root folder or .h5")
-    parser.add_argument("--format", required=True, help=f"layout of the data: {', '.join(FORMATS)}")
+    parser.add_argument(
+        "--format",
+        default="caper",
+        help=f"layout of the data: {', '.join(FORMATS)} (default: caper)",
+    )
     common.add_splits(parser)
     parser.add_argument(
         "--predictor",

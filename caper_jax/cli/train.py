@@ -81,7 +81,8 @@ def build_parser() -> argparse.ArgumentParser:
     budget.add_argument(
         "--minutes",
         type=common.positive_float,
-        help="length of the run in minutes (default: the configuration's, or 60)",
+        help="minutes of training (default: the configuration's, or 60); compiling comes before, "
+        "the fit of sides and confidence after",
     )
     budget.add_argument(
         "--steps", type=common.positive_int, help="length in steps: reproducible to the bit"
@@ -117,11 +118,9 @@ def _train(category: str, arguments: argparse.Namespace, out: Path, initial: Pat
     from caper_jax.training import run
 
     result = run.train(_configuration(category, arguments, initial), out, initial)
-    steps = int(result.state.step)
-    if not result.finished:
-        print(f"stopped at step {steps}; the same command goes on from there")
+    if not result.finished:  # which says itself where it stopped
         return common.EXIT_INTERRUPTED
-    print(f"trained {steps} steps; the model is in {out}")
+    print(f"trained {int(result.state.step)} steps; the model is in {out}")
     _plot(category, out)
     return 0
 

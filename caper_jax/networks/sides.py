@@ -141,7 +141,7 @@ def side_features(reading: Reading, cloud, share, evidence, category: Category):
     spread = jnp.einsum("bnk,bnkap->bkap", weight, passed)
     tilts = [_tilt(inside, share, side) for side in (-1.0, 1.0)]
 
-    mean_size = jnp.asarray(category.mean_size) * category.unit
+    mean_size = jnp.asarray(category.mean_size, cloud.dtype) * category.unit
     sight = (cloud.mean(1)[:, :, None] * reading.root[:, :3, :3]).sum(1)  # from the root's frame
     known = [
         *(spread, *tilts, jnp.log(count + 1.0), sight),

@@ -40,7 +40,8 @@ class TrainingConfig:
       clip_norm: bound on the global norm of the gradient.
       weight_decay: decoupled weight decay.
       steps: length of the run in steps; the result is then a function of the seed.
-      minutes: length of the run in minutes of training, summed over resumes.
+      minutes: length of the run in minutes of training, summed over resumes; compiling the step
+        does not count.
       seed: every random number of the run follows from it.
       steps_per_dispatch: steps compiled into one call, to hide the cost of calling.
       log_steps: steps averaged into one line of metrics.jsonl.
@@ -219,6 +220,7 @@ class _Run:
         self.unread: tuple[int, np.ndarray, dict[str, jax.Array]] | None = None
         self.factor = 0.0
         self.first_read = True
+        self.compiling = True  # as the first call of the step does
 
     def go(
         self,
@@ -237,7 +239,11 @@ class _Run:
                 if due:
                     self.save()
                 progress, factor = self.schedule(elapsed)
-                self.state, metrics = step_fn(self.state, progress, factor, batch_of(self.step))
+                batch, called = batch_of(self.step), time.monotonic()
+                self.state, metrics = step_fn(self.state, progress, factor, batch)
+                if self.compiling:
+                    self.compiling = False
+                    self.began += time.monotonic() - called
                 self.step += len(factor)
                 # One dispatch stays unread, so that the device need not wait for the host.
                 self.read()

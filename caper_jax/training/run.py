@@ -43,6 +43,7 @@ from caper_jax.training.calibration import check_frames as check_calibration
 from caper_jax.training.loop import FitResult, TrainingConfig, fit
 from caper_jax.training.losses import LossWeights
 from caper_jax.training.run_directory import FILE as CONFIG_FILE
+from caper_jax.training.run_directory import STARTED_FROM
 from caper_jax.training.task import LossConfig, Task
 
 _SAMPLE = 512  # frames that give the trivial predictor of the model card
@@ -175,7 +176,7 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         started_from, stored = read_model(initial)
         same = started_from.get("category") == category.name
         variables = initial_variables(variables, stored, initial, same)
-        description["initial"] = started_from
+        description[STARTED_FROM] = started_from
     if config.start_share and not same:
         raise CaperError(
             f"start_share = {config.start_share} needs a model of {category.name!r} to start from"

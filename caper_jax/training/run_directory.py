@@ -12,6 +12,7 @@ from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
 
 FILE = "config.json"
+STARTED_FROM = "initial"  # key of the card of the model that the run started from
 # Keys of the configuration that a resumed run may change: they do not touch the result.
 _FREE_KEYS = frozenset(
     {
@@ -44,14 +45,15 @@ def check_configuration(directory: Path, configuration: dict[str, Any]) -> None:
             raise CaperError(f"{path} is not valid JSON: {error}") from error
         given = _flatten(json.loads(text))
         different = [
-            f"{key} ({saved.get(key, 'absent')!r} there, {given.get(key, 'absent')!r} now)"
+            key
             for key in sorted(saved.keys() | given.keys())
             if key not in _FREE_KEYS and saved.get(key, _ABSENT) != given.get(key, _ABSENT)
         ]
         if different:
             raise CaperError(
-                f"{directory} holds a run of another configuration: {', '.join(different)}; "
-                "use its configuration to resume it, or another directory"
+                f"{directory} holds a run of another configuration: "
+                f"{_told(different, saved, given)}; use its configuration to resume it, or "
+                "another directory (a new run can start from the model of this one)"
             )
         return
     if jax.process_index() == 0:
@@ -60,6 +62,29 @@ def check_configuration(directory: Path, configuration: dict[str, Any]) -> None:
 
 
 _ABSENT = object()
+_TOLD = 8  # settings that a message names
+
+
+def _told(different: list[str], saved: dict[str, Any], given: dict[str, Any]) -> str:
+    """What differs, for a message; the card of the model that a run started from in a word."""
+    parts = []
+    start = f"{STARTED_FROM}."
+    settings = [key for key in different if not key.startswith(start)]
+    if len(settings) < len(different):
+        begun = [any(key.startswith(start) for key in keys) for keys in (saved, given)]
+        parts.append(
+            {
+                (True, True): "it started from another model",
+                (True, False): "it started from a model and this one from random weights",
+                (False, True): "it started from random weights and this one from a model",
+            }[begun[0], begun[1]]
+        )
+    for key in settings[:_TOLD]:
+        there, now = (repr(keys.get(key, "absent")) for keys in (saved, given))
+        parts.append(f"{key} ({there} there, {now} now)")
+    if len(settings) > _TOLD:
+        parts.append(f"{len(settings) - _TOLD} settings more")
+    return ", ".join(parts)
 
 
 def _flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
