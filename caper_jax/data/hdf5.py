@@ -219,6 +219,10 @@ class Hdf5Dataset:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
+    if path.is_dir():
+        raise CaperError(
+            f"{path} is a folder, and format {FORMAT!r} is one .h5 file: name the folder's format"
+        )
     if not path.is_file():
         raise CaperError(f"{path}: no such file (format {FORMAT!r} is one .h5 file)")
     try:
