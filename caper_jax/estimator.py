@@ -92,7 +92,7 @@ def estimate(
         raise CaperError(f"points must be floats, in metres, got {points.dtype}")
     # Moments of points cancel in half precision, without any NaN.
     points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
-    view = view_rotation(points)
+    view = view_rotation(points, category.viewpoint.mean_roll)
     cloud = rotate(view, points) * category.unit
     found = read(variables, cloud, category, network)
     reading = readings(variables, found, cloud, category, network)[-1]
@@ -224,7 +224,12 @@ def shipped_weights() -> Path:
     return Path(str(resources.files("caper_jax"))) / "assets" / "weights"
 
 
-def load(category: str, weights: str | Path | None = None, object_scale: float = 1.0) -> Estimator:
+def load(
+    category: str,
+    weights: str | Path | None = None,
+    object_scale: float = 1.0,
+    camera_roll: float = 0.0,
+) -> Estimator:
     """The estimator of a category.
 
     Args:
@@ -233,6 +238,8 @@ def load(category: str, weights: str | Path | None = None, object_scale: float =
         one that ships with the package.
       object_scale: how many times as large the objects are as those the model was trained on; the
         shipped models know real sizes, PartNet's objects in PM-Videos and ArtImage are larger.
+      camera_roll: degrees by which things that stand upright are turned clockwise in the image, 180
+        for a camera upside down; the shipped models know level cameras, within 15 deg.
 
     Raises:
       CaperError: unknown category, no model of it in the package, a damaged model, or one of
@@ -257,7 +264,7 @@ def load(category: str, weights: str | Path | None = None, object_scale: float =
         raise CaperError(f"{directory} holds a model of {card.get('category')!r}, not {name!r}")
     network = network_of(card, directory)
     _check_variables(directory, variables, definition, network)
-    return Estimator(definition.scaled(object_scale), network, variables, card)
+    return Estimator(definition.scaled(object_scale).rolled(camera_roll), network, variables, card)
 
 
 def network_of(card: dict[str, Any], directory: Path) -> NetworkConfig:

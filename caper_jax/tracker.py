@@ -187,6 +187,7 @@ def load_tracker(
     weights: str | Path | None = None,
     config: TrackerConfig | Sequence[str] = (),
     object_scale: float = 1.0,
+    camera_roll: float = 0.0,
 ) -> Tracker:
     """The tracker of a category, with the weights that ``load`` takes.
 
@@ -194,12 +195,12 @@ def load_tracker(
       category: e.g. "box", or "FILE.py:NAME".
       weights: a model directory; by default the one in the package.
       config: settings; or "key=value" changes to those that suit the model, see ``config_for``.
-      object_scale: see ``estimator.load``.
+      object_scale, camera_roll: see ``estimator.load``.
 
     Raises:
       CaperError: see ``estimator.load``.
     """
-    estimator = load(category, weights, object_scale)
+    estimator = load(category, weights, object_scale, camera_roll)
     if not isinstance(config, TrackerConfig):
         config = config_for(estimator, *config)
     return Tracker(estimator, config)

@@ -116,12 +116,13 @@ def test_clouds_and_depth_scale(files, seen):
     np.testing.assert_allclose(seen[1][..., 2], 0.78, rtol=1e-6)
 
 
-def test_objects_of_another_scale(files, seen, monkeypatch):
+def test_objects_of_another_scale_and_cameras_that_are_not_level(files, seen, monkeypatch):
     asked = []
     load = estimator.load
     monkeypatch.setattr("caper_jax.estimator.load", lambda *a: asked.append(a) or load(*a))
     assert run("--points", "cloud.npy", "--object-scale", "2.5") == 0
-    assert asked == [("box", None, 2.5)]
+    assert run("--points", "cloud.npy", "--camera-roll", "180") == 0
+    assert asked == [("box", None, 2.5, 0.0), ("box", None, 1.0, 180.0)]
 
 
 def test_pictures_and_pages_are_written(files, seen):

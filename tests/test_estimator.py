@@ -102,6 +102,22 @@ def test_lengths_are_metres_whatever_the_network_unit(cabinet):
     np.testing.assert_allclose(states, one.joint_state, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("degrees", [90.0, 180.0, -37.0])
+def test_a_camera_that_is_not_level_is_no_matter_where_it_is_named(cabinet, degrees):
+    turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()  # x right, y down: clockwise
+    rolled = Estimator(CABINET.rolled(degrees), cabinet.network, cabinet.variables)
+    one, other = cabinet(clouds(4)), rolled((clouds(4) @ turn.T).astype(np.float32))
+    np.testing.assert_allclose(other.pose.rotation, turn @ np.asarray(one.pose.rotation), atol=2e-4)
+    np.testing.assert_allclose(
+        other.pose.translation, np.asarray(one.pose.translation) @ turn.T, atol=1e-4
+    )
+    for name in ("size", "box_center", "joint_axis", "joint_pivot", "joint_state"):
+        expected = getattr(one.pose, name)
+        np.testing.assert_allclose(getattr(other.pose, name), expected, atol=2e-4, err_msg=name)
+    with pytest.raises(CaperError, match="camera roll must be finite, in degrees, got nan"):
+        CABINET.rolled(float("nan"))
+
+
 def test_a_turn_of_the_camera_turns_the_poses_and_nothing_else(cabinet):
     """Wherever in the image the same view of an object stands, it is found the same."""
     points = clouds(4)

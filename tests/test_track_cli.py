@@ -71,7 +71,7 @@ def scripted(monkeypatch):
     """Replaces the models; gives the trackers that were asked for."""
     made = []
 
-    def load(category, weights, config, object_scale):
+    def load(category, weights, config, object_scale, camera_roll):
         made.append(Scripted(random_pose(5), override(TrackerConfig(), *config)))
         return made[-1]
 
@@ -229,7 +229,7 @@ class TestLive:
         tracker.step = quick_jit(tracker.function)
         clouds = [CLOUD, np.zeros((0, 3)), CLOUD + np.array([0.01, 0, 0])]
         self.feed(monkeypatch, b"".join(pack_frame(c, 7 + n) for n, c in enumerate(clouds)))
-        monkeypatch.setattr("caper_jax.tracker.load_tracker", lambda *_: tracker)
+        monkeypatch.setattr("caper_jax.tracker.load_tracker", lambda **_: tracker)
         tracker(CLOUD)  # what came before is forgotten
         assert run("--live", "-") == 0
         captured = capsys.readouterr()

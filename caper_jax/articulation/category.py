@@ -74,7 +74,8 @@ class Viewpoint:
       up: the canonical axis that points away from the table, "y" for all but lying objects.
       azimuth: degrees, full circle by default; 0 looks at the front (+z).
       elevation: degrees above the table.
-      roll: degrees, symmetric about 0.
+      roll: degrees, either side of ``mean_roll``.
+      mean_roll: degrees by which things that stand upright are turned clockwise in the image.
       distance: in object diagonals.
       either_side: the object lies on its one side as often as on the other, so that cameras above
         the table look at either.
@@ -84,6 +85,7 @@ class Viewpoint:
     azimuth: tuple[float, float] = (-180.0, 180.0)
     elevation: tuple[float, float] = (5.0, 80.0)
     roll: float = 15.0
+    mean_roll: float = 0.0
     distance: tuple[float, float] = (1.5, 6.0)
     either_side: bool = False
 
@@ -174,6 +176,25 @@ class Category:
             mean_center=times(self.mean_center),
             shape=None,
         )
+
+    def rolled(self, degrees: float) -> Category:
+        """The category as cameras see it that are not level; same networks, same weights.
+
+        Args:
+          degrees: by which things are turned clockwise in the image, beyond what they were; 180
+            for a camera upside down.
+
+        Raises:
+          CaperError: an angle that is not finite.
+        """
+        from caper_jax.errors import CaperError
+
+        if not np.isfinite(degrees):
+            raise CaperError(f"camera roll must be finite, in degrees, got {degrees}")
+        if degrees == 0.0:
+            return self
+        mean_roll = self.viewpoint.mean_roll + degrees
+        return replace(self, viewpoint=replace(self.viewpoint, mean_roll=mean_roll))
 
     def __post_init__(self) -> None:
         from caper_jax.errors import CaperError, unknown_name

@@ -154,9 +154,22 @@ OBJECT_SCALE: dict[str, Any] = {
 }
 
 
-def add_object_scale(parser: argparse.ArgumentParser) -> None:
-    """The option of commands that load a model."""
+def add_model_options(parser: argparse.ArgumentParser) -> None:
+    """How objects and camera differ from what the models know, of commands that load one."""
     parser.add_argument("--object-scale", **OBJECT_SCALE)
+    parser.add_argument(
+        "--camera-roll",
+        type=float,
+        default=0.0,
+        metavar="DEG",
+        help="the camera is not level: by so many degrees its image shows things turned clockwise, "
+        "180 for upside down (models know level cameras, within 15)",
+    )
+
+
+def model_options(arguments: argparse.Namespace) -> tuple[Path | None, float, float]:
+    """What ``estimator.load`` takes besides the category."""
+    return arguments.weights, arguments.object_scale, arguments.camera_roll
 
 
 def pixel_box(text: str) -> tuple[float, float, float, float]:

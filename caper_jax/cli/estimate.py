@@ -75,7 +75,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--weights", type=Path, help="model directory (default: the shipped one of the category)"
     )
-    common.add_object_scale(parser)
+    common.add_model_options(parser)
     return parser
 
 
@@ -93,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from caper_jax.estimator import load
     from caper_jax.visualization.table import format_scene
 
-    estimator = load(category.name, arguments.weights, arguments.object_scale)
+    estimator = load(category.name, *common.model_options(arguments))
     prediction = estimator(observation.cloud.points[None])
     prediction = jax.tree.map(lambda array: np.asarray(array)[0], prediction)
     pose = prediction.pose

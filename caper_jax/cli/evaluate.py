@@ -64,7 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="also a picture of the N frames whose rotations are most off, worst.png",
     )
-    common.add_object_scale(parser)
+    common.add_model_options(parser)
     parser.add_argument("--out", required=True, type=Path, help="folder for the results")
     return parser
 
@@ -92,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.predictor != "truth":
         from caper_jax.estimator import load
 
-        estimator = load(category.name, arguments.weights, arguments.object_scale)
+        estimator = load(category.name, *common.model_options(arguments))
         weights = str(arguments.weights or f"shipped with the package ({category.name})")
         if arguments.predictor == "model":
             predictor = protocol.model_predictor(estimator)

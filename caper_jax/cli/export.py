@@ -41,7 +41,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="clouds per call, or 'any', which rounds otherwise than the package "
         "(default: %(default)s)",
     )
-    common.add_object_scale(parser)
+    common.add_model_options(parser)
     return parser
 
 
@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from caper_jax.estimator import load
     from caper_jax.export import MODEL_FILE, RUNNER_FILE, export_estimator
 
-    estimator = load(arguments.category, arguments.weights, arguments.object_scale)
+    estimator = load(arguments.category, *common.model_options(arguments))
     batch = None if arguments.batch == "any" else arguments.batch
     platforms = arguments.platform or ("cpu", "cuda")
     manifest = export_estimator(estimator, arguments.out, platforms, batch)

@@ -6,13 +6,10 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from caper_jax.cli import common
 from caper_jax.errors import CaperError
-
-if TYPE_CHECKING:
-    pass
 
 VIDEO_FORMATS = ("caper", "captra", "folder", "pm-videos", "reart-videos")
 # Options of recorded videos, by the attribute that argparse gives them.
@@ -102,7 +99,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="another setting of the tracker, e.g. filtered=false or registration.steps=0; may be "
         "repeated",
     )
-    common.add_object_scale(parser)
+    common.add_model_options(parser)
     parser.add_argument("--out", type=Path, help="folder for the results of --data")
     return parser
 
@@ -117,19 +114,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.live is not None:
         _refuse_recorded(arguments)
         with track_live.open_stream(arguments.live) as frames:
-            track_live.track_stream(load_tracker(*model), frames)
+            track_live.track_stream(load_tracker(**model), frames)
         return 0
     if arguments.out is None:
         raise CaperError("--data needs --out, the folder for the results")
     common.check_folder(arguments.out, "--out")
-    dataset, videos = track_videos.open_videos(arguments, model[0])
-    recorder = track_videos.load_recorder(*model)
+    dataset, videos = track_videos.open_videos(arguments, model["category"])
+    recorder = track_videos.load_recorder(**model)
     track_videos.track_all(arguments, recorder, dataset, videos)
     return 0
 
 
-def _model(arguments: argparse.Namespace) -> tuple[str, Path | None, list[str], float]:
-    """Which tracker: category, weights, settings as "key=value", scale of the objects."""
+def _model(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Which tracker: the arguments of ``load_tracker``."""
     from caper_jax import categories
 
     settings = [
@@ -137,8 +134,14 @@ def _model(arguments: argparse.Namespace) -> tuple[str, Path | None, list[str], 
         for key in ("policy", "interval", "threshold")
         if getattr(arguments, key) is not None
     ]
-    name = categories.get(arguments.category).name
-    return name, arguments.weights, settings + arguments.set, arguments.object_scale
+    weights, object_scale, camera_roll = common.model_options(arguments)
+    return {
+        "category": categories.get(arguments.category).name,
+        "weights": weights,
+        "config": settings + arguments.set,
+        "object_scale": object_scale,
+        "camera_roll": camera_roll,
+    }
 
 
 def _refuse_recorded(arguments: argparse.Namespace) -> None:

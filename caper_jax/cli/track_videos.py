@@ -51,11 +51,15 @@ class Recorder(Tracker):
 
 
 def load_recorder(
-    category: str, weights: Path | None, settings: Sequence[str], object_scale: float
+    category: str,
+    weights: Path | None,
+    config: Sequence[str],
+    object_scale: float,
+    camera_roll: float,
 ) -> Recorder:
     """The tracker of a category; see ``load_tracker``."""
-    estimator = load(category, weights, object_scale)
-    recorder = Recorder(estimator, config_for(estimator, *settings))
+    estimator = load(category, weights, object_scale, camera_roll)
+    recorder = Recorder(estimator, config_for(estimator, *config))
     recorder.reset()
     return recorder
 

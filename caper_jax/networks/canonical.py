@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 
 def rotate(rotation, points):
@@ -20,7 +21,7 @@ def transpose(rotation):
     return jnp.swapaxes(rotation, -1, -2)
 
 
-def view_rotation(points):
+def view_rotation(points, roll: float = 0.0):
     """The shortest rotation that turns the ray to the cloud's mean into the optical axis.
 
     An object looks the same wherever in the image it stands; after this rotation it also has the
@@ -28,10 +29,16 @@ def view_rotation(points):
 
     Args:
       points: [B, N, 3], camera frame.
+      roll: static, degrees by which things are turned clockwise in the image; that is undone
+        first (``Viewpoint.mean_roll``).
 
     Returns:
       [B, 3, 3], camera -> viewing frame.
     """
+    if roll:
+        cos, sin = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+        level = jnp.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]], points.dtype)
+        return multiply(view_rotation(rotate(level[None], points)), level)
     mean = points.mean(axis=1)
     squared = (mean * mean).sum(-1, keepdims=True)
     # A cloud around the camera itself has no viewing direction: keep the camera's.

@@ -144,7 +144,7 @@ def add_sides(
 def _measure(variables, batch: Batch, category: Category, network: NetworkConfig):
     """(features [B, F], SidesOutput that would be right, whether to learn it [B]) of every reading:
     before and after each pass of the network's sides."""
-    view = view_rotation(batch.points)
+    view = view_rotation(batch.points, category.viewpoint.mean_roll)
     cloud = rotate(view, batch.points) * category.unit
     found = read(variables, cloud, category, network)
     rows = []

@@ -125,7 +125,7 @@ class Task:
         seen = batch.points
         if self.config.root_input == "root":
             seen = part_points(batch.points, batch.labels == 0)
-        view = view_rotation(seen)
+        view = view_rotation(seen, self.category.viewpoint.mean_roll)
         points = rotate(view, batch.points) * unit
 
         def stage_one(params, model_state, batch, view, cloud, key):

@@ -41,8 +41,9 @@ def draw_camera(key, view: Viewpoint) -> Camera:
     """A camera in the ranges that the conventions ask for."""
     # One draw for all: every call of jax.random costs compile time.
     uniform = jax.random.uniform(key, (10,))
-    low = jnp.radians(jnp.array([view.azimuth[0], view.elevation[0], -view.roll]))
-    high = jnp.radians(jnp.array([view.azimuth[1], view.elevation[1], view.roll]))
+    rolls = view.mean_roll - view.roll, view.mean_roll + view.roll
+    low = jnp.radians(jnp.array([view.azimuth[0], view.elevation[0], rolls[0]]))
+    high = jnp.radians(jnp.array([view.azimuth[1], view.elevation[1], rolls[1]]))
     azimuth, elevation, roll = low + uniform[:3] * (high - low)
     # Uniform in log distance: relative, as perspective is.
     nearest, farthest = np.log(view.distance)
@@ -88,7 +89,8 @@ def camera_arc(key, camera: Camera, view: Viewpoint, frames: int, speed) -> Came
     azimuth = np.radians(view.azimuth)
     if azimuth[1] - azimuth[0] >= 2 * np.pi:
         azimuth = np.array([-np.inf, np.inf])
-    elevation, roll = np.radians(view.elevation), np.radians([-view.roll, view.roll])
+    elevation = np.radians(view.elevation)
+    roll = np.radians([view.mean_roll - view.roll, view.mean_roll + view.roll])
     low, high = jnp.array([azimuth, elevation, roll, np.log(view.distance)]).T
     end = start + change
     end = jnp.where((end < low) | (end > high), start - change, end)
