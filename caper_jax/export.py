@@ -155,6 +155,7 @@ def _manifest(estimator: Estimator, exported: export.Exported) -> dict[str, Any]
                 **_array(points),
                 "unit": "metres",
                 "frame": FRAME,
+                "camera_roll_deg": category.viewpoint.mean_roll,  # see ``Category.rolled``
                 "sampling": _SAMPLING,
             }
         },

@@ -191,12 +191,14 @@ def test_the_command_exports_a_model_of_ones_own(drawer, tmp_path, capsys):
     write_model(tmp_path / "model", estimator.variables, estimator.card)
     command = ["export", "--category", "drawer", "--weights", str(tmp_path / "model")]
     out = tmp_path / "a" / "b"
-    options = ["--platform", "cpu", "--batch", "2", "--object-scale", "3"]
+    options = ["--platform", "cpu", "--batch", "2", "--object-scale", "3", "--camera-roll", "-90"]
     assert cli.main([*command, *options, "--out", str(out)]) == 0
     assert f"written: {out}" in capsys.readouterr().out
     manifest, plain = (json.loads((f / "manifest.json").read_text()) for f in (out, folder))
     assert manifest["platforms"] == ["cpu"]
     assert manifest["inputs"]["points"]["shape"] == [2, 64, 3]
+    rolls = [m["inputs"]["points"]["camera_roll_deg"] for m in (manifest, plain)]
+    assert rolls == [-90.0, 0.0]
     for scaled, part in zip(manifest["parts"], plain["parts"], strict=True):
         np.testing.assert_allclose(scaled["mean_size"], 3 * np.array(part["mean_size"]))
 

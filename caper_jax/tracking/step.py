@@ -291,7 +291,6 @@ def _track_step(
         trial=jnp.where(replaced, config.trial, left).astype(jnp.int32),
         lost=jnp.asarray(False),
     )
-    after = of_type(after, state.root.dtype)
     held = replace(
         state,
         root_velocity=jnp.zeros_like(state.root_velocity),
