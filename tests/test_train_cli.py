@@ -90,6 +90,20 @@ def test_a_run_that_ended_leaves_its_model_as_it_is(model, monkeypatch):
     assert read_model(model)[0] == card
 
 
+def test_other_processes_wait_until_the_model_is_whole(tmp_path, monkeypatch):
+    """One that ended while the first still fits sides and confidence would take the run down."""
+    agree, whole = run.parallel.agree, []
+
+    def waiting(values):
+        card = tmp_path / "model.json"
+        whole.append(card.is_file() and "complete" in read_model(tmp_path)[0])
+        return agree(values)
+
+    monkeypatch.setattr(run.parallel, "agree", waiting)
+    assert cli.main(["train", *TINY, "--steps", "2", "--out", str(tmp_path)]) == 0
+    assert whole[-1] and not any(whole[:-1])
+
+
 def test_a_run_replaces_the_model_of_another_run(model, tmp_path):
     for name in ("weights.npz", "model.json"):  # complete, and of as many steps
         shutil.copy(model / name, tmp_path)

@@ -23,6 +23,7 @@ from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.cli import demo
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Prediction
+from caper_jax.visualization import picture
 from caper_jax.visualization import scene as scenes
 from caper_jax.visualization.figures import save_figure
 from caper_jax.visualization.page import write_page
@@ -179,6 +180,17 @@ def test_picture_and_page_of_odd_scenes(tmp_path: Path, changes: dict):
     scene = arm_scene(**changes)
     assert read_png(write_picture(tmp_path / "a.png", [scene])).shape[1] > 1000
     assert page_data(write_page(tmp_path / "a.html", [scene]).read_text("utf-8"))["scenes"]
+
+
+def test_pictures_say_whether_there_was_an_image(tmp_path: Path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(picture, "save_figure", lambda figure, *_, **__: drawn.append(figure))
+    write_picture(tmp_path / "a.png", [arm_scene()])
+    cloud = {"truth": None, "depth": None, "mask": None, "intrinsics": None}
+    write_picture(tmp_path / "a.png", [arm_scene(**cloud)])
+    image, points = ([axes.get_title() for axes in figure.axes[:3]] for figure in drawn)
+    assert image[:2] == ["Depth image and mask", "Estimate over the depth image"]
+    assert points == ["Points by distance", "Estimate over the points", image[2]]
 
 
 def test_page_loads_nothing_and_escapes_names(page_text: str):

@@ -195,7 +195,6 @@ def _track_step(
     # A frame without points runs through the same arithmetic, on points where the object was.
     stand_in = se3.act(state.root, key.points) + jnp.array([0.0, 0.0, 1e-3])
     points = jnp.where(frame.present, frame.points * category.unit, stand_in)
-    points = points.astype(state.root.dtype)
 
     predicted = (
         se3.compose(state.root, se3.exp(config.damping * state.root_velocity)),
