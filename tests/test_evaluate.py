@@ -57,8 +57,7 @@ def estimator(monkeypatch):
 
 def run(path, out, *options):
     return cli.main(
-        ["evaluate", "--category", "box", "--data", str(path), "--format", "caper"]
-        + ["--out", str(out), *options]
+        ["evaluate", "--category", "box", "--data", str(path), "--out", str(out), *options]
     )
 
 
@@ -203,6 +202,13 @@ def test_the_mean_stands_at_the_cloud_and_obeys_kinematics(path):
     for k, rotation in enumerate((root, lid)):  # the hinge is where both parts have it
         found = rotation @ hinge + pose.translation[:, k]
         np.testing.assert_allclose(found, expected + root @ hinge, atol=1e-6)
+
+
+def test_results_name_the_roll_that_the_model_was_told_of(path, tmp_path, estimator):
+    for options, told in (((), False), (("--camera-roll", "-90"), True)):
+        assert run(path, tmp_path, "--limit", "5", *options) == 0
+        weights = json.loads((tmp_path / "metrics.json").read_text())["weights"]
+        assert weights.endswith(", told of a camera roll of -90 deg") == told
 
 
 def test_mean_predictor_runs_from_the_card(path, tmp_path, estimator, capsys):

@@ -96,6 +96,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         weights = str(arguments.weights or f"shipped with the package ({category.name})")
         if arguments.predictor == "model":
             predictor = protocol.model_predictor(estimator)
+            if arguments.camera_roll:
+                weights += f", told of a camera roll of {arguments.camera_roll:g} deg"
         elif "mean_pose" in estimator.card:
             predictor = protocol.mean_predictor(category, estimator.card["mean_pose"], weights)
         else:
