@@ -129,7 +129,7 @@ def test_settings_of_the_loader_stand_beside_data(tmp_path, monkeypatch, capsys)
     assert cli.main([*begin, *data]) == 130
     assert configs[2].loader == replace(configs[0].loader, format="caper")
     assert cli.main([*begin, "--set", "loader.workers=7"]) == 2
-    assert "there is no loader in this run" in capsys.readouterr().err
+    assert "--set loader.* goes with --data" in capsys.readouterr().err
 
 
 def test_another_configuration_in_the_same_folder_is_refused(model, capsys):

@@ -205,7 +205,7 @@ def test_poses_of_other_frames_are_noticed(tmp_path):
         (["--split", "val"], "no split 'val'; it lists test, train"),
         (["--data", "absent"], "absent: no such folder"),
         (["--format", "reartmix"], "holds no reartmix data of a known category"),
-        (["--format", "caper"], "is a folder, and format 'caper' is one .h5 file"),
+        (["--format", "caper"], "no such file but a folder (format 'caper' is one .h5 file; name"),
         (["--format", "caper", "--data", "no.h5"], "no.h5: no such file (format 'caper'"),
         (["--workers", "0"], "whole number above 0"),
     ],

@@ -151,6 +151,8 @@ def _configuration(category: str, arguments: argparse.Namespace, initial: Path |
     if arguments.config is not None:
         # A file may say how --data is read, and does not replace it.
         config = _with_dataset(update(config, arguments.config), arguments)
+    if config.loader is None and any(o.startswith("loader.") for o in arguments.overrides):
+        raise CaperError("--set loader.* goes with --data, or a [loader] in the configuration")
     config = override(config, *arguments.overrides)
     if config.category != category:
         raise CaperError(

@@ -221,7 +221,8 @@ class Hdf5Dataset:
 def _opened(path: Path) -> Iterator[h5py.File]:
     if path.is_dir():
         raise CaperError(
-            f"{path} is a folder, and format {FORMAT!r} is one .h5 file: name the folder's format"
+            f"{path}: no such file but a folder (format {FORMAT!r} is one .h5 file; name the "
+            "folder's own format)"
         )
     if not path.is_file():
         raise CaperError(f"{path}: no such file (format {FORMAT!r} is one .h5 file)")
