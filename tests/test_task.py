@@ -154,7 +154,7 @@ class Oracle(Task):
         """(total loss, points that stage II is given, metrics) when the networks answer so."""
         if not hasattr(self, "_jitted"):
             self._jitted = jax.jit(lambda params, batch: self.loss(params, *self._rest(batch)))
-        view = view_rotation(batch.points)
+        view = view_rotation(batch.points, self.category.viewpoint.mean_roll)
         params = (pose, jnp.asarray(labels), view, jnp.asarray(error.as_matrix(), jnp.float32))
         total, (state, metrics) = self._jitted({"root": params, "parts": params}, batch)
         return total, np.asarray(state["seen"]["parts"]), metrics
@@ -193,6 +193,12 @@ def test_the_truth_costs_nothing(task):
     for name, value in metrics.items():
         assert abs(value) < 2e-5, name
     assert total < 1e-3
+
+
+def test_networks_learn_from_what_a_camera_that_is_not_level_would_see_level():
+    rolled = Oracle(BOX.rolled(90.0), BOXES.network, BOXES.config)
+    batch = frames(BOX, [THIN, DEEP])
+    assert rolled.play(batch, batch.pose, batch.labels)[0] < 1e-3
 
 
 def test_the_order_of_the_points_does_not_matter():

@@ -336,6 +336,11 @@ def test_float32_weights_and_clouds_in_64_bit_jax():
     assert found.pose.rotation.dtype == begin.root.dtype == np.float64
 
 
+def test_a_tracker_is_told_how_its_camera_is_turned():
+    tracker = load_tracker("box", camera_roll=180.0)
+    assert tracker.estimator.category == categories.get("box").rolled(180.0)
+
+
 def test_slopes_remember_the_states_between_frames_alone():
     """Whatever a frame computes is computed again, so that long videos can be differentiated."""
     tracker = toy()
