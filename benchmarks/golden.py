@@ -21,19 +21,23 @@ import jax.numpy as jnp
 import numpy as np
 
 import caper_jax as caper
-from caper_jax.data.cloud import cloud_from_depth
+from caper_jax.config import (
+    FastEncoderConfig,
+    GeneratorConfig,
+    HeadConfig,
+    HSEncoderConfig,
+    LossConfig,
+    NetworkConfig,
+    RotationClassifierConfig,
+)
+from caper_jax.data.clouds import cloud_from_depth
 from caper_jax.data.images import read_depth, read_intrinsics, read_mask
-from caper_jax.data.synthetic.config import GeneratorConfig
-from caper_jax.data.synthetic.scene import Generator
-from caper_jax.data.synthetic.videos import VideoGenerator
 from caper_jax.export import export_estimator
-from caper_jax.networks.caper import NetworkConfig
-from caper_jax.networks.fast_encoder import FastEncoderConfig
-from caper_jax.networks.heads import HeadConfig
-from caper_jax.networks.hs_encoder import HSEncoderConfig
+from caper_jax.synthetic.frames import Generator
+from caper_jax.synthetic.videos import VideoGenerator
+from caper_jax.training.objective import Objective
 from caper_jax.training.optimizer import Optimizer
-from caper_jax.training.state import TrainState, make_step
-from caper_jax.training.task import LossConfig, Task
+from caper_jax.training.step import TrainState, make_step
 
 DEMO = Path(caper.__file__).parent / "assets" / "demo"
 SMALL = HeadConfig(widths=(16, 16, 16))
@@ -85,17 +89,17 @@ def training(encoder: str) -> dict[str, np.ndarray]:
     category = caper.categories.get("box")
     network = NetworkConfig(
         encoder=encoder,
-        hs=HSEncoderConfig(channels=(8, 8, 16, 16, 16), neighbours=6, supports=2),
+        hs=HSEncoderConfig(channels=(8, 8, 16, 16, 16), neighbors=6, supports=2),
         fast=FastEncoderConfig(centers=16, stride=1, width=16, blocks=1, last=16),
         root_heads=SMALL,
         pooled_heads=SMALL,
         point_heads=SMALL,
-        turn_width=16,
+        rotation_classifier=RotationClassifierConfig(16),
         num_points=128,
     )
     loss = LossConfig()
     generator = Generator(category, GeneratorConfig(instances=8, grid=16, num_points=128))
-    task = Task(category, network, loss)
+    task = Objective(category, network, loss)
     name = "ranger" if encoder == "hs" else "adamw"
     optimizer = Optimizer(name=name, learning_rate=1e-3)
     variables = task.init(jax.random.key(0))

@@ -24,7 +24,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> CaperError:
     return CaperError(f"unknown {kind} {name!r}{hint} (known: {', '.join(names)})")
 
 
-def check_least(section: str, config: Any, **bounds: float) -> None:
+def check_bounds(section: str, config: Any, **bounds: float) -> None:
     """CaperError for a number of a configuration that is below its bound or not finite, or none.
 
     Args:

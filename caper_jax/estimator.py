@@ -13,18 +13,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from caper_jax import categories, confidence
+from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.confidence import Calibration
-from caper_jax.configuration import from_dict
-from caper_jax.data.cloud import MIN_POINTS, are_sampled, sample_points
+from caper_jax.config import NetworkConfig, from_dict
+from caper_jax.data.clouds import MIN_POINTS, are_sampled, sample_points
 from caper_jax.errors import CaperError
-from caper_jax.model_files import CARD_FILE, flatten, read_model
-from caper_jax.networks.canonical import rotate, view_rotation
-from caper_jax.networks.caper import NetworkConfig, PartsNetwork, RootNetwork
-from caper_jax.networks.sides import SidesNetwork, num_features
-from caper_jax.reading import articulated_pose, read, readings
+from caper_jax.geometry.frames import rotate, view_rotation
+from caper_jax.models import uncertainty
+from caper_jax.models.files import CARD_FILE, flatten, read_model
+from caper_jax.models.networks import PartsNetwork, RootNetwork
+from caper_jax.models.pipeline import articulated_pose, read, refinements
+from caper_jax.models.refiner import BoxRefiner, num_features
+from caper_jax.models.uncertainty import Calibration
 
 
 @flax.struct.dataclass
@@ -32,19 +33,19 @@ class Prediction:
     """What the estimator finds; leading axes [...] are those of its input.
 
     Attributes:
-      pose: ArticulatedPose in the camera frame, metres.
+      pose: ArticulatedPose in the camera frame, meters.
       points: [..., M, 3] the points the networks saw: the input itself when it has as many points
         as they take, else an even pick of it.
       labels: [..., M] int32 part of each of ``points``.
       confidence: [..., 2] of the root's two directions, in (0, 1) (Sec 5.1.1).
       degenerate: [...] bool, the two directions were parallel or zero: the rotation is arbitrary.
       seen: [..., K] int32 how many of ``points`` show each part; one with fewer than
-        ``confidence.HIDDEN_POINTS`` is hidden, and known through its joints alone.
-      evidence: [..., K, 6] see ``confidence.evidence``.
+        ``uncertainty.HIDDEN_POINTS`` is hidden, and known through its joints alone.
+      evidence: [..., K, 6] see ``uncertainty.evidence``.
       rotation_std, translation_std: [..., K] standard deviations about and along each axis, radians
-        and metres; the truth lies within 2.5 of them nine times in ten. None, as is the next, where
-        the model is not calibrated. See ``confidence.pose_covariance``.
-      state_std: [..., J] radians or metres; nine in ten within 1.64.
+        and meters; the truth lies within 2.5 of them nine times in ten. None, as is the next, where
+        the model is not calibrated. See ``uncertainty.pose_covariance``.
+      state_std: [..., J] radians or meters; nine in ten within 1.64.
     """
 
     pose: ArticulatedPose
@@ -69,12 +70,12 @@ def estimate(
     """The pure function under the estimator: jit, vmap and differentiate it at will.
 
     Differentiable with respect to ``variables`` and ``points`` (labels and the choice of
-    neighbours are not). vmap over stacked variables runs several models on one cloud.
+    neighbors are not). vmap over stacked variables runs several models on one cloud.
 
     Args:
       variables: {"params": {"root", "parts"}, "batch_stats": {...}} as trained; with
-        ``network.sides_width`` also "sides" among "params".
-      points: [B, N, 3] metres, camera frame, finite; half precision is computed with in float32.
+        ``network.refiner.width`` also "refiner" among "params".
+      points: [B, N, 3] meters, camera frame, finite; half precision is computed with in float32.
       category: static.
       network: static.
       calibration: gives the standard deviations.
@@ -89,13 +90,13 @@ def estimate(
         raise CaperError(f"points must be [B, N, 3], got {jnp.shape(points)}")
     points = jnp.asarray(points)
     if not jnp.issubdtype(points.dtype, jnp.floating):
-        raise CaperError(f"points must be floats, in metres, got {points.dtype}")
+        raise CaperError(f"points must be floats, in meters, got {points.dtype}")
     # Moments of points cancel in half precision, without any NaN.
     points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
-    view = view_rotation(points, category.viewpoint.mean_roll)
+    view = view_rotation(points, category.viewpoint.camera_roll)
     cloud = rotate(view, points) * category.unit
     found = read(variables, cloud, category, network)
-    reading = readings(variables, found, cloud, category, network)[-1]
+    reading = refinements(variables, found, cloud, category, network)[-1]
     labels = found.segmentation.argmax(-1).astype(jnp.int32)
     prediction = Prediction(
         pose=articulated_pose(reading, view, category),
@@ -103,17 +104,17 @@ def estimate(
         labels=labels,
         confidence=found.confidence,
         degenerate=found.degenerate,
-        seen=confidence.points_of_parts(labels, category.num_parts),
+        seen=uncertainty.points_of_parts(labels, category.num_parts),
         evidence=found.evidence,
     )
     if calibration is None:
         return prediction
-    turn, shift, off = confidence.radii(calibration, found.evidence)
+    turn, shift, off = uncertainty.radii(calibration, found.evidence)
     state_units = jnp.asarray(category.state_units, off.dtype)
     return prediction.replace(  # type: ignore[attr-defined]
-        rotation_std=turn / confidence.RADIUS_3D,
-        translation_std=shift / confidence.RADIUS_3D / category.unit,
-        state_std=off / confidence.RADIUS_1D / state_units,
+        rotation_std=turn / uncertainty.RADIUS_3D,
+        translation_std=shift / uncertainty.RADIUS_3D / category.unit,
+        state_std=off / uncertainty.RADIUS_1D / state_units,
     )
 
 
@@ -143,7 +144,7 @@ class Estimator:
         if "calibration" in self.card:
             source = f"model card of {category.name}"
             section = self.card["calibration"]
-            self.calibration = confidence.from_card(section, category.num_parts, source)
+            self.calibration = uncertainty.from_card(section, category.num_parts, source)
         self.function = partial(
             estimate, category=category, network=network, calibration=self.calibration
         )
@@ -158,13 +159,13 @@ class Estimator:
         unchanged.
 
         Args:
-          points: [N, 3] or [B, N, 3] metres, camera frame (OpenCV), in any order.
+          points: [N, 3] or [B, N, 3] meters, camera frame (OpenCV), in any order.
 
         Returns:
           Prediction with the leading axes of ``points``.
 
         Raises:
-          CaperError: wrong shape or dtype, fewer than 16 usable points, or points in millimetres.
+          CaperError: wrong shape or dtype, fewer than 16 usable points, or points in millimeters.
         """
         if isinstance(points, jax.core.Tracer):
             _check_shape(points.shape)
@@ -288,9 +289,9 @@ def _check_variables(directory: Path, variables, category: Category, network: Ne
         "root": (RootNetwork(network), points, {"train": False}),
         "parts": (PartsNetwork(network, parts), points, {"train": False}),
     }
-    if network.sides_width:
+    if network.refiner.width:
         features = jax.ShapeDtypeStruct((2, num_features(parts)), jnp.float32)
-        modules["sides"] = SidesNetwork(network.sides_width, parts), features, {}
+        modules["refiner"] = BoxRefiner(network.refiner.width, parts), features, {}
     collections = ["params", "batch_stats"]
     try:
         # Without a key: drawing random weights takes longer to trace than the networks.

@@ -2,7 +2,7 @@
 
 The files are ``model.stablehlo`` (a portable artifact of StableHLO, as ``jax.export`` lowers it),
 ``manifest.json`` and ``run.py``, which needs jax and numpy alone. The container that
-``jax.export`` would serialise is not used, as reading it takes a further package, flatbuffers.
+``jax.export`` would serialize is not used, as reading it takes a further package, flatbuffers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jax import export
 
 from caper_jax._version import __version__
 from caper_jax.articulation.category import Category
-from caper_jax.data.cloud import FARTHEST_M, MIN_POINTS
+from caper_jax.data.clouds import FARTHEST_M, MIN_POINTS
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.estimator import Estimator, Prediction
 from caper_jax.files import write_atomically
@@ -42,18 +42,18 @@ _OUTPUTS = {
         "1",
         "[B, K, 3, 3] from the part's rest frame: p_camera = rotation p + translation",
     ),
-    "translation": ("metres", "[B, K, 3] see rotation"),
-    "size": ("metres", "[B, K, 3] extents of the part's box in its rest frame"),
-    "box_center": ("metres", "[B, K, 3] centre of that box in the rest frame"),
+    "translation": ("meters", "[B, K, 3] see rotation"),
+    "size": ("meters", "[B, K, 3] extents of the part's box in its rest frame"),
+    "box_center": ("meters", "[B, K, 3] center of that box in the rest frame"),
     "joint_axis": ("1", "[B, J, 3] unit vectors in the root's rest frame; positive states open"),
-    "joint_pivot": ("metres", "[B, J, 3] a point on the axis, in the root's rest frame"),
+    "joint_pivot": ("meters", "[B, J, 3] a point on the axis, in the root's rest frame"),
     "joint_state": ("state", "[B, J] from the rest pose"),
     "labels": ("1", "[B, num_points] part of each point"),
     "confidence": ("1", "[B, 2] of the two directions that give the root's rotation, in (0, 1)"),
     "degenerate": ("1", "[B] whether the rotation is arbitrary, as those directions were parallel"),
     "seen": ("1", "[B, K] how many of the points show each part"),
     "rotation_std": ("radians", "[B, K] standard deviation about each axis"),
-    "translation_std": ("metres", "[B, K] standard deviation along each axis"),
+    "translation_std": ("meters", "[B, K] standard deviation along each axis"),
     "state_std": ("state", "[B, J] standard deviation"),
 }
 _CARD = (
@@ -83,7 +83,7 @@ def export_estimator(
 ) -> dict[str, Any]:
     """Writes an estimator as ``model.stablehlo``, ``manifest.json`` and ``run.py``.
 
-    The model takes points [B, num_points, 3], float32 metres in the camera frame, and gives a dict
+    The model takes points [B, num_points, 3], float32 meters in the camera frame, and gives a dict
     of arrays, see ``flat``. With a fixed batch it gives what ``estimator`` gives for a batch of
     that size; with an open one it differs as a float32 computation in another order does.
 
@@ -153,9 +153,9 @@ def _manifest(estimator: Estimator, exported: export.Exported) -> dict[str, Any]
         "inputs": {
             "points": {
                 **_array(points),
-                "unit": "metres",
+                "unit": "meters",
                 "frame": FRAME,
-                "camera_roll_deg": category.viewpoint.mean_roll,  # see ``Category.rolled``
+                "camera_roll_deg": category.viewpoint.camera_roll,  # see ``Category.rolled``
                 "sampling": _SAMPLING,
             }
         },
@@ -179,7 +179,7 @@ def _array(aval: Any) -> dict[str, Any]:
 
 
 def _state_unit(joint_type: str) -> str:
-    return "radians" if joint_type == "revolute" else "metres"
+    return "radians" if joint_type == "revolute" else "meters"
 
 
 def _parts(category: Category) -> list[dict[str, Any]]:

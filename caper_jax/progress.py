@@ -24,7 +24,7 @@ class Progress(Protocol):
 
 
 def plain_output(stream: TextIO) -> bool:
-    """Whether ``stream`` wants neither colours nor moving output."""
+    """Whether ``stream`` wants neither colors nor moving output."""
     return not stream.isatty() or "NO_COLOR" in os.environ or os.environ.get("TERM") == "dumb"
 
 

@@ -10,13 +10,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from caper_jax.configuration import from_dict, override
-from caper_jax.data.cloud import FARTHEST_M, MIN_POINTS, as_cloud, is_measured, sample_points
+from caper_jax.config import TrackerConfig, from_dict, override
+from caper_jax.data.clouds import FARTHEST_M, MIN_POINTS, as_cloud, is_measured, sample_points
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load
-from caper_jax.tracking.config import TrackerConfig
 from caper_jax.tracking.state import Observation, TrackerState
-from caper_jax.tracking.step import Tracked, given_state, initial_state, track_step
+from caper_jax.tracking.step import TrackResult, given_state, initial_state, track_step
 
 _RIGID = 1e-2  # how far R R^T of a given pose may be from the identity
 
@@ -24,7 +23,7 @@ _RIGID = 1e-2  # how far R R^T of a given pose may be from the identity
 class Tracker:
     """Tracks one object through a stream of clouds.
 
-    The model is the single-frame estimator's: its stage II, shown a cloud canonicalised by a
+    The model is the single-frame estimator's: its stage II, shown a cloud canonicalized by a
     keyframe's pose, gives the increment from there.
 
     Attributes:
@@ -36,7 +35,7 @@ class Tracker:
 
     Example:
       tracker = load_tracker("laptop")
-      for points in clouds:          # [N, 3] metres, camera frame; N may vary, and be 0
+      for points in clouds:          # [N, 3] meters, camera frame; N may vary, and be 0
           result = tracker(points)
           result.pose.rotation, result.lost
     """
@@ -64,14 +63,14 @@ class Tracker:
         """Forgets the video; optionally begins another one with a known pose.
 
         Args:
-          points: [N, 3] metres, the frame whose pose is known; None to let the estimator begin.
+          points: [N, 3] meters, the frame whose pose is known; None to let the estimator begin.
           rotation: [K, 3, 3] part frame -> camera in that frame.
-          translation: [K, 3] metres.
+          translation: [K, 3] meters.
           labels: [N] int, parts of the points, where they are known.
 
         Raises:
           CaperError: too few usable points, no points beside a pose, or poses of other shapes or
-            that are no rigid motions in metres. The track goes on as it was.
+            that are no rigid motions in meters. The track goes on as it was.
         """
         if points is None:
             if rotation is not None or translation is not None:
@@ -91,13 +90,13 @@ class Tracker:
         """A frame of any number of points as the step takes it.
 
         Args:
-          points: [N, 3] metres, camera frame, N may be 0; NaN, infinite and zero points and those
+          points: [N, 3] meters, camera frame, N may be 0; NaN, infinite and zero points and those
             beyond 50 m are left out. Fewer than 16 usable points count as a frame that does not
             show the object.
           labels: [N] int parts, -1 where unknown; by default all are predicted.
 
         Raises:
-          CaperError: wrong shape or dtype, points in millimetres or behind the camera, or labels
+          CaperError: wrong shape or dtype, points in millimeters or behind the camera, or labels
             that are no parts.
         """
         count = self.estimator.network.num_points
@@ -122,13 +121,13 @@ class Tracker:
             raise CaperError(f"labels must be integers from -1 to {parts - 1}")
         return labels.astype(np.int32)
 
-    def __call__(self, points, labels=None) -> Tracked:
+    def __call__(self, points, labels=None) -> TrackResult:
         """Tracks through the next frame; see ``observe`` for the arguments."""
         observation = self.observe(points, labels)
         self.state, result = self.step(self.estimator.variables, self.state, observation)
         return result
 
-    def track(self, observations: Observation, state: TrackerState | None = None) -> Tracked:
+    def track(self, observations: Observation, state: TrackerState | None = None) -> TrackResult:
         """Tracks through a recording in one compiled scan; ``self.state`` stays as it is.
 
         Args:
@@ -136,7 +135,7 @@ class Tracker:
           state: where to begin; by default before the first frame.
 
         Returns:
-          Tracked with a leading axis of T.
+          TrackResult with a leading axis of T.
         """
         begin = self.initial_state() if state is None else state
         return self._scan(self.estimator.variables, begin, observations)[1]
@@ -146,7 +145,7 @@ class Tracker:
 
 
 def _first_pose(rotation, translation, parts: int) -> tuple[np.ndarray, np.ndarray]:
-    """A given pose as float32 [K, 3, 3] and [K, 3]; CaperError unless it is rigid, in metres."""
+    """A given pose as float32 [K, 3, 3] and [K, 3]; CaperError unless it is rigid, in meters."""
     try:
         rotation = np.asarray(rotation, np.float32)
         translation = np.asarray(translation, np.float32)
@@ -162,7 +161,7 @@ def _first_pose(rotation, translation, parts: int) -> tuple[np.ndarray, np.ndarr
         raise CaperError("the first pose's rotation must hold rotation matrices")
     if not (np.abs(translation) <= FARTHEST_M).all():
         raise CaperError(
-            f"the first pose's translation must be metres, at most {FARTHEST_M:g}, "
+            f"the first pose's translation must be meters, at most {FARTHEST_M:g}, "
             f"got {np.abs(translation).max():.4g}"
         )
     return rotation, translation

@@ -15,7 +15,7 @@ from caper_jax.articulation.pose import ArticulatedPose
 
 @dataclass(frozen=True)
 class Stored:
-    """How a CAPTRA object is stored: link numbers, axes and states at which it was modelled.
+    """How a CAPTRA object is stored: link numbers, axes and states at which it was modeled.
 
     Attributes:
       links: part k is link ``links[k]``.

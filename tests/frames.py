@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from caper_jax.articulation.pose import ArticulatedPose
 
 # Field of ArticulatedPose, its name in the truth.npz of the ArtImage and PM-Videos samples, and how
-# far a reader may be from what an independent program computed (metres, radians).
+# far a reader may be from what an independent program computed (meters, radians).
 TRUTH_FIELDS = [
     ("rotation", "R", 1e-5),
     ("translation", "t", 1e-5),

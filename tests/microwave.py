@@ -13,7 +13,7 @@ from caper_jax.geometry.solids import box, cylinder
 
 
 def shape(rng: np.random.Generator) -> ObjectModel:
-    """Draws one oven; sizes in metres are those of table-top ones."""
+    """Draws one oven; sizes in meters are those of table-top ones."""
     width, height, depth = rng.uniform((0.42, 0.24, 0.3), (0.56, 0.34, 0.46))
     wall = rng.uniform(0.015, 0.03)
     panel = width * rng.uniform(0.18, 0.3)  # with the buttons, beside the door

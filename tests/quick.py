@@ -1,4 +1,4 @@
-"""Programs that run once: compiling without optimisation takes half the time."""
+"""Programs that run once: compiling without optimization takes half the time."""
 
 from __future__ import annotations
 

@@ -19,9 +19,9 @@ from caper_jax import categories
 from caper_jax.articulation.category import ObjectModel
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data import hdf5
-from caper_jax.data.artimage_writer import LayoutWriter
-from caper_jax.data.synthetic.render import Image
 from caper_jax.geometry import solids
+from caper_jax.synthetic.artimage_writer import LayoutWriter
+from caper_jax.synthetic.render import Image
 
 SIZE = (96, 72)  # width, height
 CAMERA = np.array([[120.0, 0.0, 47.0], [0.0, 118.0, 36.0], [0.0, 0.0, 1.0]])
@@ -30,7 +30,7 @@ OBJECTS = (101, 102)
 
 @dataclass(frozen=True)
 class Thing:
-    """An object at rest in our canonical frame, metres: boxes and joints on the root."""
+    """An object at rest in our canonical frame, meters: boxes and joints on the root."""
 
     category: str
     center: np.ndarray

@@ -8,7 +8,7 @@ from caper_jax.geometry.solids import Solid
 
 
 def _depth(solid: Solid, points: np.ndarray) -> np.ndarray:
-    """[N] least distance, in metres, from points [N, 3] to the faces of a solid without its hole.
+    """[N] least distance, in meters, from points [N, 3] to the faces of a solid without its hole.
 
     Negative outside; for slanted and curved faces a value of that order.
     """
@@ -25,7 +25,7 @@ def _depth(solid: Solid, points: np.ndarray) -> np.ndarray:
 
 
 def inside(solid: Solid, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
-    """[N] bool: points [N, 3] in the solid, at least ``margin`` metres below its surface."""
+    """[N] bool: points [N, 3] in the solid, at least ``margin`` meters below its surface."""
     within = _depth(solid, points) > margin
     if solid.hole is not None:
         within &= _depth(solid.hole, points) < -margin
@@ -35,7 +35,7 @@ def inside(solid: Solid, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
 def deepest_overlap(
     rng: np.random.Generator, moving: list[Solid], fixed: list[Solid], pose: np.ndarray
 ) -> float:
-    """How deep, in metres, points of ``moving`` under ``pose`` [4, 4] lie in ``fixed``.
+    """How deep, in meters, points of ``moving`` under ``pose`` [4, 4] lie in ``fixed``.
 
     0 when none does. The points are sampled on surfaces, with all corners of boxes.
     """
@@ -55,7 +55,7 @@ def deepest_overlap(
 
 
 def loose(solids: list[Solid], slack: float = 1e-3) -> list[int]:
-    """Indices of the solids that no chain of others, each within ``slack`` metres, holds to the
+    """Indices of the solids that no chain of others, each within ``slack`` meters, holds to the
     first.
     """
     rng = np.random.default_rng(0)

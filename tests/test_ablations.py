@@ -14,14 +14,14 @@ from tiny import network, random_variables
 from tracks import disturbed
 
 from caper_jax import categories
-from caper_jax.configuration import override
+from caper_jax.config import override
 from caper_jax.data import hdf5
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator
 from caper_jax.evaluation import protocol
-from caper_jax.evaluation.tables import ablations, root_pose, trainings
-from caper_jax.evaluation.tables.render import Scatter
-from caper_jax.training import run as training
+from caper_jax.reproduce import ablations, root_pose, trainings
+from caper_jax.reproduce.render import Scatter
+from caper_jax.training import train as training
 from caper_jax.visualization.curves import write_scatter
 
 LAPTOP = categories.get("laptop")
@@ -152,5 +152,5 @@ def test_stage_one_alone_is_the_uncorrected_root():
 def test_scatter_keeps_what_lies_beyond_its_axes(tmp_path):
     values = np.append(np.linspace(-1, 1, 200), 1e6)
     panels = {"one": (values, values, values), "other": (values, -values, values)}
-    write_scatter(tmp_path / "s.png", Scatter("title", "x", "y", "colour", panels))
+    write_scatter(tmp_path / "s.png", Scatter("title", "x", "y", "color", panels))
     assert (tmp_path / "s.png").stat().st_size > 10_000

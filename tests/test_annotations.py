@@ -6,9 +6,9 @@ import pytest
 import roots
 from formats import FORMATS, write_root
 
-from caper_jax.data import open_dataset
-from caper_jax.data.links import polygon_labels, split_transformation
-from caper_jax.data.reartmix import ReArtMixDataset
+from caper_jax.data.readers import open_dataset
+from caper_jax.data.readers.annotated import polygon_labels, split_transformation
+from caper_jax.data.readers.reartmix import ReArtMixDataset
 from caper_jax.errors import CaperError
 
 

@@ -10,9 +10,9 @@ from frames import TRUTH_FIELDS
 from PIL import Image
 
 from caper_jax import categories
-from caper_jax.data import open_dataset
-from caper_jax.data.artimage import TEST_OBJECTS, ArtImageDataset
-from caper_jax.data.schema import validate
+from caper_jax.data.readers import open_dataset
+from caper_jax.data.readers.artimage import TEST_OBJECTS, ArtImageDataset
+from caper_jax.data.types import validate
 from caper_jax.errors import CaperError
 
 SAMPLES = ("laptop", "drawer", "dishwasher")
@@ -161,8 +161,8 @@ def test_depth_in_three_channels(root, first, tmp_path):
     copy_root(root, tmp_path)
     path = tmp_path / "laptop/train/depth/000000.png"
     depth = np.asarray(Image.open(path))
-    colour = np.stack([depth % 256, depth // 256, np.zeros_like(depth)], axis=-1)  # R, G, B
-    Image.fromarray(colour.astype(np.uint8)).save(path)
+    color = np.stack([depth % 256, depth // 256, np.zeros_like(depth)], axis=-1)  # R, G, B
+    Image.fromarray(color.astype(np.uint8)).save(path)
     np.testing.assert_array_equal(ArtImageDataset(tmp_path, "laptop")[0].depth, first.depth)
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
 from caper_jax.articulation.category import Category, Joint
-from caper_jax.data.artimage_models import read_model
+from caper_jax.data.readers.artimage_models import read_model
 from caper_jax.errors import CaperError
 
 

@@ -11,14 +11,14 @@ from caper_jax import categories
 from caper_jax.articulation.category import Joint
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.cli import generate, generate_layout
-from caper_jax.data import open_dataset
-from caper_jax.data.artimage_writer import LayoutWriter
-from caper_jax.data.schema import validate
-from caper_jax.data.synthetic.bank import draw_models
-from caper_jax.data.synthetic.render import Image
-from caper_jax.data.synthetic.surface import surface_points
+from caper_jax.data.readers import open_dataset
+from caper_jax.data.types import validate
 from caper_jax.errors import CaperError
 from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.synthetic.artimage_writer import LayoutWriter
+from caper_jax.synthetic.instances import draw_instances
+from caper_jax.synthetic.render import Image
+from caper_jax.synthetic.surface import surface_points
 
 SIZE = 64
 CAMERA = np.array([[91.4, 0.0, 31.5], [0.0, 90.0, 32.5], [0.0, 0.0, 1.0]])
@@ -82,7 +82,7 @@ def test_every_category_reads_back(tmp_path, name):
     category = categories.get(name)
     rng = np.random.default_rng(7)
     for split in ("train", "test"):
-        models = draw_models(category, 2, split, 3)
+        models = draw_instances(category, 2, split, 3)
         images = [seen(model, posed(model, category, rng)) for model in models]
         writer = LayoutWriter(tmp_path, category, split, CAMERA, (SIZE, SIZE))
         for index, (model, image) in enumerate(zip(models, images, strict=True)):
@@ -130,8 +130,8 @@ def test_rendered_images_as_of_artimage(tmp_path, small):
         validate(frame, dataset.category)
         assert_whole(frame)
         assert (frame.depth[~frame.mask] == 0).all()
-    with Picture.open(tmp_path / "laptop/train/color/000000.jpg") as colour:
-        assert colour.size == (SIZE, SIZE)
+    with Picture.open(tmp_path / "laptop/train/color/000000.jpg") as color:
+        assert color.size == (SIZE, SIZE)
     with pytest.raises(CaperError, match=r"test\.txt: lists frames already"):
         run(tmp_path, "--layout", "artimage", "--frames", "1")
 
@@ -177,7 +177,7 @@ def test_options_that_contradict_each_other(tmp_path, arguments, message):
 
 def test_a_root_has_one_camera_and_every_object_once(tmp_path):
     category = categories.get("box")
-    model = draw_models(category, 1, "train", 0)[0]
+    model = draw_instances(category, 1, "train", 0)[0]
     writer = LayoutWriter(tmp_path, category, "train", CAMERA, (SIZE, SIZE))
     writer.add_object(7, model)
     with pytest.raises(CaperError, match="holds an object 7 already"):
@@ -192,7 +192,7 @@ def test_a_root_has_one_camera_and_every_object_once(tmp_path):
 
 def test_objects_of_a_run_that_was_cut_off_are_not_mixed_in(tmp_path):
     category = categories.get("box")
-    first, second = draw_models(category, 2, "train", 0)
+    first, second = draw_instances(category, 2, "train", 0)
     LayoutWriter(tmp_path, category, "train", CAMERA, (SIZE, SIZE)).add_object(7, first)
     points = next(tmp_path.glob("box/urdf/7/*/0.xyz")).read_bytes()
     writer = LayoutWriter(tmp_path, category, "train", CAMERA, (SIZE, SIZE))
@@ -203,7 +203,7 @@ def test_objects_of_a_run_that_was_cut_off_are_not_mixed_in(tmp_path):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_surface_points_reach_the_bounds_and_lie_within(name):
-    for model in draw_models(categories.get(name), 5, "train", 1):
+    for model in draw_instances(categories.get(name), 5, "train", 1):
         for solids in model.parts:
             points = surface_points(solids, 300, np.random.default_rng(0))
             low, high = bounds(solids)
@@ -215,7 +215,7 @@ def test_the_stored_joints_have_the_public_sign(tmp_path):
     """The axis of a revolute joint is written reversed, that of a prismatic one as it is."""
     laptop = categories.get("laptop")
     assert laptop.joints[0] == Joint("revolute", 0, laptop.joints[0].limits)
-    model = draw_models(laptop, 1, "train", 0)[0]
+    model = draw_instances(laptop, 1, "train", 0)[0]
     writer = LayoutWriter(tmp_path, laptop, "train", CAMERA, (SIZE, SIZE))
     writer.add_object(7, model)
     text = (tmp_path / "laptop/urdf/7/mobility_for_unity_align.urdf").read_text()

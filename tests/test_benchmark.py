@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from tiny import HS, random_like
 
-from caper_jax import cli
+from benchmarks import __main__ as benchmark
+from benchmarks import gate, iou, naive, profile, se3, timing
+from benchmarks.models import chain, random_estimator
+from caper_jax import cli, machine
 from caper_jax.articulation.kinematics import forward_kinematics
-from caper_jax.cli import benchmark
-from caper_jax.cli.benchmarks import gate, iou, naive, profile, se3, timing
-from caper_jax.cli.benchmarks.models import chain, random_estimator
+from caper_jax.config import PRESETS, preset
 from caper_jax.errors import CaperError
-from caper_jax.networks import caper, hs_encoder
-from caper_jax.networks.hs_encoder import HSEncoder
-from caper_jax.networks.presets import PRESETS, preset
+from caper_jax.models import networks as caper
+from caper_jax.models.encoders import hs as hs_encoder
+from caper_jax.models.encoders.hs import HSEncoder
 
 BASELINE = {"estimator": 2.0, "log": 0.4}
 
@@ -79,7 +80,7 @@ def test_a_loss_of_a_quarter_is_named(ratios, slower, capsys):
 
 def test_gate_measures_again_before_it_fails(monkeypatch, tmp_path, capsys):
     path = tmp_path / "baseline.json"
-    path.write_text(json.dumps({"other": {"log": 9.0}, timing.processor(): BASELINE}))
+    path.write_text(json.dumps({"other": {"log": 9.0}, machine.processor(): BASELINE}))
     monkeypatch.setattr(gate, "measured", lambda: {name: (name, None) for name in BASELINE})
     found = {"estimator": iter([1.0, 2.1]), "log": iter([0.1, 0.2])}
     monkeypatch.setattr(gate, "ratio", lambda ours, reference, repeats: next(found[ours]))
@@ -92,7 +93,7 @@ def test_gate_measures_again_before_it_fails(monkeypatch, tmp_path, capsys):
     arguments = ["benchmark", "gate", "--update", "--baseline", str(path)]
     assert cli.main([*arguments, "--json", str(tmp_path / "out.json")]) == 0
     own = {"estimator": 5.0, "log": 0.5}
-    assert gate.read_baselines(path) == {"other": {"log": 9.0}, timing.processor(): own}
+    assert gate.read_baselines(path) == {"other": {"log": 9.0}, machine.processor(): own}
     report = json.loads((tmp_path / "out.json").read_text())
     assert {row["verdict"] for row in report["rows"]} == {"ok"}
 

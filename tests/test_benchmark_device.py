@@ -12,10 +12,8 @@ import pytest
 import tiny
 from quick import quick_jit
 
-from caper_jax import categories, cli
-from caper_jax import estimator as estimators
-from caper_jax.cli import benchmark
-from caper_jax.cli.benchmarks import (
+from benchmarks import __main__ as benchmark
+from benchmarks import (
     ceilings,
     costs,
     estimator,
@@ -24,10 +22,12 @@ from caper_jax.cli.benchmarks import (
     tracker,
     training,
 )
-from caper_jax.data.synthetic.config import GeneratorConfig
+from caper_jax import categories, cli
+from caper_jax import estimator as estimators
+from caper_jax.config import GeneratorConfig
 from caper_jax.training import parallel
-from caper_jax.training import run as runs
-from caper_jax.training.task import Task
+from caper_jax.training import train as runs
+from caper_jax.training.objective import Objective
 
 BOX = categories.get("box")
 
@@ -151,10 +151,9 @@ def test_clouds_of_a_large_batch_need_no_more_shapes(monkeypatch):
         def batch(self, key, count):
             return type("Batch", (), {"points": np.zeros((count, 8, 3))})
 
-    from caper_jax.cli.benchmarks import models
-    from caper_jax.data.synthetic import scene
+    from benchmarks import models
 
-    monkeypatch.setattr(scene, "Generator", Generator)
+    monkeypatch.setattr("caper_jax.synthetic.frames.Generator", Generator)
     assert models.clouds(BOX, 1000).shape == (1000, 8, 3)
     assert built == [200]
 
@@ -193,14 +192,14 @@ def tiny_preset(monkeypatch):
 def test_steps_of_training(count, few, tiny_preset, monkeypatch):
     """Several per call, or one whose batch eight devices share: they sum at least the gradient."""
     variables = {"params": {"shift": np.ones(3, np.float32)}}
-    monkeypatch.setattr(Task, "init", lambda task, key: variables)
+    monkeypatch.setattr(Objective, "init", lambda task, key: variables)
 
     def loss(task, params, model_state, batch, key, progress):
         """In place of the networks', which compile for half a minute."""
         assert batch.points.shape == (8, 64, 3)
         return jnp.mean((batch.points - params["shift"]) ** 2), (model_state, {})
 
-    monkeypatch.setattr(Task, "loss", loss)
+    monkeypatch.setattr(Objective, "loss", loss)
     mesh = parallel.data_mesh() if count == 1 else None
     step = training.make("box", "fast", 8, count, mesh)
     assert step.batch == 8 and step.gradients["shift"].shape == (3,)

@@ -10,9 +10,9 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks import __main__ as benchmark
+from benchmarks import cost_model, processes, worker
 from caper_jax import cli
-from caper_jax.cli import benchmark
-from caper_jax.cli.benchmarks import cost_model, processes, worker
 from caper_jax.errors import CaperError
 from caper_jax.estimator import load
 from caper_jax.training import parallel
@@ -88,7 +88,7 @@ def test_mistakes(cores, argv, message, monkeypatch):
 STAND_IN = """
     import os, sys, time
     import jax, numpy as np
-    from caper_jax.cli.benchmarks import costs, training, worker
+    from benchmarks import costs, training, worker
 
     def make(category, preset, batch, mesh, batch_norm):
         assert batch == 8 and batch_norm == "local" and mesh.size == jax.process_count() == 2

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from solid_points import inside, loose
 
 from caper_jax import categories
-from caper_jax.data.synthetic.bank import build_bank, draw_models
 from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.synthetic.instances import build_bank, draw_instances
 
 # Length, height and depth of the base of the eight measured ReArt-48 boxes span these ranges, mm.
 MEASURED = ((201, 243), (24, 38), (74, 94))
@@ -19,12 +19,12 @@ MEASURED = ((201, 243), (24, 38), (74, 94))
 
 @pytest.fixture(scope="module")
 def boxes():
-    return draw_models(categories.get("box"), 300, "train", 11)
+    return draw_instances(categories.get("box"), 300, "train", 11)
 
 
 @pytest.fixture(scope="module")
 def laptops():
-    return draw_models(categories.get("laptop"), 300, "train", 11)
+    return draw_instances(categories.get("laptop"), 300, "train", 11)
 
 
 def sizes(models, part):

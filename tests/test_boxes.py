@@ -12,7 +12,8 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
 from caper_jax.errors import CaperError
-from caper_jax.geometry import boxes, so3
+from caper_jax.geometry import boxes
+from caper_jax.lie import so3
 
 KINDS = {
     # worst error in float64 against scipy, in float32 against float64 on the same numbers
@@ -29,7 +30,7 @@ KINDS = {
 
 
 def pairs(kind: str, count: int = 30) -> tuple[np.ndarray, ...]:
-    """Rotation, centre and size of a, then of b: [count, 3, 3], [count, 3], [count, 3]."""
+    """Rotation, center and size of a, then of b: [count, 3, 3], [count, 3], [count, 3]."""
     g = np.random.default_rng(list(KINDS).index(kind))
 
     def turns() -> np.ndarray:

@@ -11,10 +11,10 @@ from roots import DRAWER, EYEGLASSES, LAPTOP, OBJECTS, motions, posed, render
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
-from caper_jax.data import open_dataset
-from caper_jax.data.captra import TEST_OBJECTS, CaptraDataset
-from caper_jax.data.captra_models import read_model, read_obj
-from caper_jax.data.schema import validate
+from caper_jax.data.readers import open_dataset
+from caper_jax.data.readers.captra import TEST_OBJECTS, CaptraDataset
+from caper_jax.data.readers.captra_models import read_model, read_obj
+from caper_jax.data.types import validate
 from caper_jax.errors import CaperError
 
 THINGS = {thing.category: thing for thing in (LAPTOP, DRAWER, EYEGLASSES)}
@@ -59,17 +59,17 @@ def test_frames_come_back_with_the_truth_they_were_made_of(tmp_path, name):
     "fields",
     [
         {"root": 1},  # the base hangs on the lid
-        {"states": (np.radians(-90),), "limits": ((-2.0, 0.0),)},  # modelled closed
+        {"states": (np.radians(-90),), "limits": ((-2.0, 0.0),)},  # modeled closed
         # No state that means something in the file is near the rest pose.
         {"states": (np.radians(37),), "limits": ((-0.5, 0.2),)},
     ],
 )
-def test_laptops_modelled_in_any_way(tmp_path, monkeypatch, fields):
+def test_laptops_modeled_in_any_way(tmp_path, monkeypatch, fields):
     changed(monkeypatch, "laptop", **fields)
     assert_known(captra(tmp_path), LAPTOP)
 
 
-def test_drawers_modelled_open(tmp_path, monkeypatch):
+def test_drawers_modeled_open(tmp_path, monkeypatch):
     changed(
         monkeypatch,
         "drawer",
@@ -79,7 +79,7 @@ def test_drawers_modelled_open(tmp_path, monkeypatch):
     assert_known(captra(tmp_path, DRAWER), DRAWER)
 
 
-def test_eyeglasses_modelled_folded(tmp_path, monkeypatch):
+def test_eyeglasses_modeled_folded(tmp_path, monkeypatch):
     changed(
         monkeypatch,
         "eyeglasses",
@@ -90,7 +90,7 @@ def test_eyeglasses_modelled_folded(tmp_path, monkeypatch):
 
 
 def test_scissors(tmp_path):
-    """Two crossed halves, the root's handle longer; modelled 10 deg apart, standing upright."""
+    """Two crossed halves, the root's handle longer; modeled 10 deg apart, standing upright."""
     corners = np.array(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing="ij")).reshape(3, -1).T
     stand = Rotation.from_euler("xy", [90, 30], degrees=True)  # our y lies level in the file
     halves = []

@@ -12,11 +12,11 @@ from quick import quick_jit
 from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.category import ObjectModel
-from caper_jax.data.synthetic.bank import build_bank
-from caper_jax.data.synthetic.caster import FAR, cast, part_depths, projected_bounds
 from caper_jax.errors import CaperError
 from caper_jax.geometry.solid_bounds import bounds
 from caper_jax.geometry.solids import Solid, box, cone, cylinder, ellipsoid, frustum
+from caper_jax.synthetic.instances import build_bank
+from caper_jax.synthetic.ray_casting import FAR, cast, part_depths, projected_bounds
 
 KINDS = ("box", "cylinder", "ellipsoid", "frustum", "cone")
 FLAT = ("box", "frustum")
@@ -27,7 +27,7 @@ SIDE = 72  # rays per side
 
 
 def random_solid(rng: np.random.Generator, kind: str, center, scale: float, hole=None) -> Solid:
-    """Half extents of 5 to 100 % of ``scale``, metres, turned at random."""
+    """Half extents of 5 to 100 % of ``scale``, meters, turned at random."""
     half = scale * rng.uniform(0.05, 1.0, 3)
     rotation = Rotation.random(rng=rng).as_matrix()
     if kind == "frustum":
@@ -205,7 +205,7 @@ def test_agrees_with_embree(scene, index):
     both = (depth < FAR) & (expected < FAR)
     assert both.sum() > 100
     assert ((depth < FAR) == (expected < FAR)).mean() >= 0.999
-    # 512 sections of a radius of 0.1 m: chords lie up to 2 micrometres inside the surface.
+    # 512 sections of a radius of 0.1 m: chords lie up to 2 micrometers inside the surface.
     assert np.median(np.abs(depth - expected)[both]) < (1e-6 if flat else 4e-6)
 
 

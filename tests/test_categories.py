@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from caper_jax import categories
-from caper_jax.articulation.category import Category, Equivalence, Joint
-from caper_jax.data.synthetic.bank import draw_models
+from caper_jax.articulation.category import Category, Joint, Symmetry
 from caper_jax.errors import CaperError
 from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.synthetic.instances import draw_instances
 
 NAMES = categories.names()
 INSTANCES = 300
@@ -19,9 +19,9 @@ INSTANCES = 300
 
 @pytest.fixture(scope="module", params=NAMES)
 def drawn(request):
-    """(category, instances centred as the generator uses them, part boxes [n, K, 2, 3])."""
+    """(category, instances centered as the generator uses them, part boxes [n, K, 2, 3])."""
     category = categories.get(request.param)
-    models = draw_models(category, INSTANCES, "train", 0)
+    models = draw_instances(category, INSTANCES, "train", 0)
     boxes = np.array([[bounds(part) for part in model.parts] for model in models])
     return category, models, boxes
 
@@ -88,8 +88,8 @@ def test_a_definition_counts_its_parts():
         ({"mean_center": ((0.0, 0.0, np.nan),) * 3}, "mean_center must be finite"),
         ({"unit": -1.0}, "unit and mean_size must be positive"),
         ({"closed": "shut"}, "closed is 'low', 'high' or None, got 'shut'"),
-        ({"equivalences": (Equivalence((0, 1), EYE, "why"),)}, "must permute the parts"),
-        ({"equivalences": (Equivalence((2, 1, 0), MIRROR, "why"),)}, "is not a rotation"),
+        ({"symmetries": (Symmetry((0, 1), EYE, "why"),)}, "must permute the parts"),
+        ({"symmetries": (Symmetry((2, 1, 0), MIRROR, "why"),)}, "is not a rotation"),
         ({"directions": ("y", "y")}, "two directions must differ"),
         ({"mean_size": ((1.0, 1.0, 1.0),) * 2}, r"mean_size must be \[3, 3\]"),
         ({"mean_center": ((0.0, 0.0),) * 3}, r"mean_center must be \[3, 3\]"),
@@ -117,7 +117,7 @@ def test_numbers_keep_their_meaning(name, parts, directions):
     assert category.joint_types == ("revolute",) and category.parents == (0,)
 
 
-def test_origin_is_the_centre_of_the_whole_at_rest(drawn):
+def test_origin_is_the_center_of_the_whole_at_rest(drawn):
     _, _, boxes = drawn
     low, high = boxes[:, :, 0].min(1), boxes[:, :, 1].max(1)
     np.testing.assert_allclose(low + high, 0.0, atol=1e-12)
@@ -157,7 +157,7 @@ def test_clamshells_rest_and_open_as_agreed(name):
     rests open by 90 deg: the lid stands above its hinge behind the base, and leans back.
     """
     category = categories.get(name)
-    for model in draw_models(category, 50, "test", 1):
+    for model in draw_instances(category, 50, "test", 1):
         (base, lid), pivot = (bounds(part) for part in model.parts), model.pivot[0]
         np.testing.assert_allclose(np.abs(model.axis), [[1, 0, 0]], atol=1e-12)
         assert pivot[2] < 0
@@ -174,12 +174,12 @@ def test_clamshells_rest_and_open_as_agreed(name):
 def test_declared_equivalences_are_half_turns_that_exchange_parts():
     for name in NAMES:
         category = categories.get(name)
-        for equivalence in category.equivalences:
-            assert isinstance(equivalence, Equivalence) and equivalence.reason
-            order = np.array(equivalence.permutation)
+        for symmetry in category.symmetries:
+            assert isinstance(symmetry, Symmetry) and symmetry.reason
+            order = np.array(symmetry.permutation)
             assert sorted(order) == list(range(category.num_parts))
             assert (order[order] == np.arange(len(order))).all()
-            turn = np.array(equivalence.turn)
+            turn = np.array(symmetry.turn)
             np.testing.assert_allclose(turn @ turn, np.eye(3), atol=1e-12)
             np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
             assert np.linalg.det(turn) > 0

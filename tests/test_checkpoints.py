@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from caper_jax.errors import CaperError
-from caper_jax.model_files import flatten, read_model, unflatten, write_model
+from caper_jax.models.files import flatten, read_model, unflatten, write_model
 from caper_jax.training import parallel
 from caper_jax.training.checkpoints import Checkpoints, CheckpointWarning
 from caper_jax.training.optimizer import Optimizer
-from caper_jax.training.state import TrainState
+from caper_jax.training.step import TrainState
 
 
 def make_state(step: int, width: int = 40) -> TrainState:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from caper_jax.data.cloud import (
+from caper_jax.data.clouds import (
     are_sampled,
     cloud_from_depth,
     read_points,
@@ -156,7 +156,7 @@ def test_raw_clouds_are_checked():
     np.testing.assert_array_equal(cloud.index, np.setdiff1d(np.arange(200), [3, 7, 11]))
     np.testing.assert_array_equal(cloud.points, points[cloud.index].astype(np.float32))
     for bad, message in (
-        (points * 1000, "cloud.npy: median depth .* millimetres: multiply by 0.001"),
+        (points * 1000, "cloud.npy: median depth .* millimeters: multiply by 0.001"),
         (points * [1, -1, -1], "behind the camera"),
         (points[:, :2], r"a cloud must be \[N, 3\]"),
         (points.astype(str), "must be numbers"),

@@ -14,14 +14,14 @@ from scipy.optimize import linprog
 from scipy.stats import chi
 from tiny import network, random_variables
 
-from caper_jax import categories, cli, confidence
-from caper_jax.articulation.equivalence import second_reading
-from caper_jax.configuration import to_dict
-from caper_jax.data.synthetic.config import GeneratorConfig
+from caper_jax import categories, cli
+from caper_jax.articulation.symmetry import apply_symmetry
+from caper_jax.config import GeneratorConfig, to_dict
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load
-from caper_jax.evaluation.tables import reliability
-from caper_jax.model_files import write_model
+from caper_jax.models import uncertainty
+from caper_jax.models.files import write_model
+from caper_jax.reproduce import reliability
 from caper_jax.training import calibration
 
 BOX = categories.get("box")
@@ -29,20 +29,20 @@ BOX = categories.get("box")
 
 def section(**changes):
     """A calibration of two parts that says 0.1 rad, 0.2 units and 0.3 rad of every frame."""
-    zeros = np.zeros(confidence.EVIDENCE).tolist()
+    zeros = np.zeros(uncertainty.EVIDENCE).tolist()
     rows = {name: [*zeros, float(np.log(value))] for name, value in (("r", 0.1), ("t", 0.2))}
     return {
         "rotation": [rows["r"]] * 2,
         "translation": [rows["t"]] * 2,
         "state": [[*zeros, float(np.log(0.3))]],
-        "low": [-1.0] * confidence.EVIDENCE,
-        "high": [1.0] * confidence.EVIDENCE,
+        "low": [-1.0] * uncertainty.EVIDENCE,
+        "high": [1.0] * uncertainty.EVIDENCE,
     } | changes
 
 
 def test_radii_of_a_normal_distribution():
-    assert pytest.approx(chi(3).ppf(confidence.COVERAGE), abs=1e-6) == confidence.RADIUS_3D
-    assert pytest.approx(chi(1).ppf(confidence.COVERAGE), abs=1e-6) == confidence.RADIUS_1D
+    assert pytest.approx(chi(3).ppf(uncertainty.COVERAGE), abs=1e-6) == uncertainty.RADIUS_3D
+    assert pytest.approx(chi(1).ppf(uncertainty.COVERAGE), abs=1e-6) == uncertainty.RADIUS_1D
     for radius in (0.1, 1.0, 2.5):
         assert reliability.ball_share(radius) == pytest.approx(chi(3).cdf(radius))
         assert reliability.interval_share(radius) == pytest.approx(chi(1).cdf(radius))
@@ -51,8 +51,8 @@ def test_radii_of_a_normal_distribution():
 def test_evidence_counts_doubts_and_asks_about_parts():
     logits = np.log(np.array([[0.9, 0.1]] * 15 + [[0.5, 0.5001]], np.float32))[None]
     twist = np.array([[0, 0.3, 0.4, 0, 0, 0.2]], np.float32)
-    found = confidence.evidence(np.array([[0.999, 0.2]], np.float32), twist, logits)
-    assert found.shape == (1, 2, confidence.EVIDENCE)
+    found = uncertainty.evidence(np.array([[0.999, 0.2]], np.float32), twist, logits)
+    assert found.shape == (1, 2, uncertainty.EVIDENCE)
     entropy = (15 * -(0.9 * np.log(0.9) + 0.1 * np.log(0.1)) + np.log(2)) / 16
     frame = [np.log(0.002), np.log(0.801), np.log(0.501), np.log(0.201), entropy]
     for part, count in enumerate((15, 1)):
@@ -64,10 +64,10 @@ def test_radii_grow_with_the_evidence_up_to_what_was_seen():
     rotation = np.array(section()["rotation"])
     rotation[1, 0] = 2.0
     card = section(rotation=rotation.tolist(), state=[[0, 3.0, 0, 0, 0, 0, 0]])
-    fitted = confidence.from_card(card, 2, "card")
-    found = np.zeros((3, 2, confidence.EVIDENCE), np.float32)
+    fitted = uncertainty.from_card(card, 2, "card")
+    found = np.zeros((3, 2, uncertainty.EVIDENCE), np.float32)
     found[1:, :, 0], found[:, 1, 1] = [[0.5], [50.0]], 0.25
-    turn, shift, state = confidence.radii(fitted, found)
+    turn, shift, state = uncertainty.radii(fitted, found)
     np.testing.assert_allclose(turn[:, 0], 0.1, rtol=1e-5)
     np.testing.assert_allclose(turn[:, 1], 0.1 * np.exp([0, 1, 2]), rtol=1e-5)
     np.testing.assert_allclose(shift, 0.2, rtol=1e-5)
@@ -76,7 +76,7 @@ def test_radii_grow_with_the_evidence_up_to_what_was_seen():
 
 def test_covariance_is_that_of_twists():
     rng = np.random.default_rng(0)
-    covariance = confidence.pose_covariance(np.array([0.1, 0.2]), np.array([0.01, 0.03]))
+    covariance = uncertainty.pose_covariance(np.array([0.1, 0.2]), np.array([0.01, 0.03]))
     twists = rng.normal(size=(20000, 6)) * np.repeat([0.2, 0.03], 3)
     np.testing.assert_allclose(covariance[1], np.cov(twists.T), atol=2e-3)
 
@@ -88,13 +88,13 @@ def test_readings_of_equal_halves_count_as_the_nearer():
     size = np.repeat(truth.size[:, :1], 2, 1)
     size[3, 1] *= [1.2, 1.0, 1.0]
     truth = dataclasses.replace(truth, size=size)
-    (equivalence,) = scissors.equivalences
-    other = second_reading(truth, equivalence, scissors)
+    (symmetry,) = scissors.symmetries
+    other = apply_symmetry(truth, symmetry, scissors)
     rows = np.array([1, 3])
     estimate = jax.tree.map(np.array, truth)
     for name in vars(estimate):
         getattr(estimate, name)[rows] = getattr(other, name)[rows]
-    found = calibration.nearer_reading(estimate, truth, scissors)
+    found = calibration.nearer_symmetry(estimate, truth, scissors)
     for name, values in vars(found).items():
         np.testing.assert_allclose(values[:3], getattr(estimate, name)[:3], atol=1e-6)
         np.testing.assert_allclose(values[3], getattr(truth, name)[3], atol=1e-6)
@@ -128,7 +128,7 @@ def test_quantile_regression_is_the_linear_program(level):
 )
 def test_bad_sections_are_named(changes, message):
     with pytest.raises(CaperError, match=message):
-        confidence.from_card(section(**changes), 2, "card")
+        uncertainty.from_card(section(**changes), 2, "card")
 
 
 class TestModel:
@@ -147,13 +147,13 @@ class TestModel:
         monkeypatch.setattr(jax, "jit", quick_jit)
         found = load("box", folder)(np.random.default_rng(0).normal(size=(64, 3)) + [0, 0, 2.0])
         assert found.rotation_std is found.state_std is None
-        assert found.seen.sum() == 64 and found.evidence.shape == (2, confidence.EVIDENCE)
+        assert found.seen.sum() == 64 and found.evidence.shape == (2, uncertainty.EVIDENCE)
 
     def test_calibrate_makes_the_stated_region_hold_the_truth(
         self, folder, tmp_path, monkeypatch, capsys
     ):
         monkeypatch.setattr(jax, "jit", quick_jit)
-        monkeypatch.setattr("caper_jax.training.run.TRAINING_DATA", self.CONFIG)
+        monkeypatch.setattr("caper_jax.training.train.TRAINING_DATA", self.CONFIG)
         command = ["calibrate", "--category", "box", "--weights", str(folder), "--frames"]
         assert cli.main([*command, "20"]) == 2
         assert "320 frames or more, got 20" in capsys.readouterr().err
@@ -190,10 +190,10 @@ class TestModel:
         points = np.float32(np.random.default_rng(0).normal(size=(64, 3)) * 0.1 + [0, 0, 1.0])
         small = Estimator(BOX, sizes, variables, card)(points)
         large = Estimator(BOX.scaled(2.0), sizes, variables, card)(2 * points)
-        np.testing.assert_allclose(small.rotation_std, 0.1 / confidence.RADIUS_3D, rtol=1e-5)
+        np.testing.assert_allclose(small.rotation_std, 0.1 / uncertainty.RADIUS_3D, rtol=1e-5)
         np.testing.assert_allclose(large.rotation_std, small.rotation_std, rtol=1e-5)
         np.testing.assert_allclose(large.translation_std, 2 * small.translation_std, rtol=1e-5)
         np.testing.assert_allclose(
-            small.translation_std, 0.2 / BOX.unit / confidence.RADIUS_3D, rtol=1e-5
+            small.translation_std, 0.2 / BOX.unit / uncertainty.RADIUS_3D, rtol=1e-5
         )
-        np.testing.assert_allclose(small.state_std, 0.3 / confidence.RADIUS_1D, rtol=1e-5)
+        np.testing.assert_allclose(small.state_std, 0.3 / uncertainty.RADIUS_1D, rtol=1e-5)

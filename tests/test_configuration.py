@@ -11,9 +11,9 @@ from typing import Literal
 import pytest
 
 from caper_jax import configuration
+from caper_jax.config import TrainingConfig
 from caper_jax.errors import CaperError
-from caper_jax.training import run as runs
-from caper_jax.training.loop import TrainingConfig
+from caper_jax.training import train as runs
 
 
 @dataclass(frozen=True)

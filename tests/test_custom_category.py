@@ -16,16 +16,16 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
 from caper_jax.cli.generate import main as generate
-from caper_jax.configuration import to_dict
-from caper_jax.data import hdf5, open_dataset
-from caper_jax.data.synthetic.bank import build_bank, draw_models
-from caper_jax.data.synthetic.scene import GeneratorConfig
+from caper_jax.config import GeneratorConfig, to_dict
+from caper_jax.data import hdf5
+from caper_jax.data.readers import open_dataset
 from caper_jax.errors import CaperError
 from caper_jax.estimator import load
 from caper_jax.geometry.solid_bounds import bounds
-from caper_jax.model_files import write_model
-from caper_jax.training import run
-from caper_jax.training.task import Task
+from caper_jax.models.files import write_model
+from caper_jax.synthetic.instances import build_bank, draw_instances
+from caper_jax.training import train as run
+from caper_jax.training.objective import Objective
 
 FILE = Path(microwave.__file__)
 
@@ -75,7 +75,7 @@ def test_models_of_it_load_under_any_spelling(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(run, "_fit_generated", skip)
-        patch.setattr(Task, "init", lambda *_: {})
+        patch.setattr(Objective, "init", lambda *_: {})
         run.train(config, tmp_path)
     (config, category, described), *_ = trained
     assert config.category == described == category.name == "microwave"
@@ -104,7 +104,7 @@ def test_from_python_the_object_is_enough():
 
 
 def test_the_example_keeps_its_own_conventions():
-    models = draw_models(microwave.MICROWAVE, 200, "train", 0)
+    models = draw_instances(microwave.MICROWAVE, 200, "train", 0)
     bank = build_bank(models)
     np.testing.assert_allclose(bank.size.mean(0), microwave.MICROWAVE.mean_size, atol=0.01)
     np.testing.assert_allclose(bank.box_center.mean(0), microwave.MICROWAVE.mean_center, atol=0.01)

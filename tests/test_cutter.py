@@ -7,8 +7,8 @@ import pytest
 from solid_points import inside, loose
 
 from caper_jax import categories
-from caper_jax.data.synthetic.bank import draw_models
 from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.synthetic.instances import draw_instances
 
 # Length, height and width of the body, and length and width of the blade with its carrier, of the
 # nine measured ReArt-48 cutters, mm.
@@ -27,7 +27,7 @@ MEASURED = [
 
 @pytest.fixture(scope="module")
 def cutters():
-    return draw_models(categories.get("cutter"), 200, "train", 3)
+    return draw_instances(categories.get("cutter"), 200, "train", 3)
 
 
 def boxes(model):
@@ -108,7 +108,7 @@ def test_sizes_are_those_of_real_cutters(cutters):
 
 
 def test_every_measured_cutter_has_one_like_it():
-    models = draw_models(categories.get("cutter"), 1000, "train", 0)
+    models = draw_instances(categories.get("cutter"), 1000, "train", 0)
     size = np.array([np.ptp(boxes(model), axis=1) for model in models])
     drawn = np.concatenate([size[:, 0], size[:, 1, [0, 2]]], axis=-1)
     ratio = np.abs(np.log(drawn[:, None] / (np.array(MEASURED) / 1000))).max(-1).min(0)

@@ -6,8 +6,8 @@ import pytest
 import roots
 from formats import FORMATS, write_root
 
-from caper_jax.data import OFFICIAL_SPLITS, categories_in, open_dataset, splits_in
-from caper_jax.data.schema import NoFramesError, validate
+from caper_jax.data.readers import OFFICIAL_SPLITS, categories_in, open_dataset, splits_in
+from caper_jax.data.types import NoFramesError, validate
 from caper_jax.errors import CaperError
 
 OBJECTS = {

@@ -7,8 +7,8 @@ import pytest
 from depth_videos import write_video
 from PIL import Image
 
-from caper_jax.data.cloud import cloud_from_depth
-from caper_jax.data.depth_folder import DepthFolder, is_depth_folder
+from caper_jax.data.clouds import cloud_from_depth
+from caper_jax.data.readers.depth_folder import DepthFolder, is_depth_folder
 from caper_jax.errors import CaperError
 
 MATRIX = np.array([[90.0, 0, 31.5], [0, 95.0, 23.5], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""Rotation from two directions (paper Eq 3), against a numerical minimiser."""
+"""Rotation from two directions (paper Eq 3), against a numerical minimizer."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from caper_jax.errors import CaperError
-from caper_jax.geometry.directions import rotation_from_directions
+from caper_jax.geometry.two_axis_rotation import rotation_from_directions
 
 AXES = list(itertools.permutations("xyz", 2))
 solve = jax.jit(rotation_from_directions, static_argnames="axes")
@@ -43,7 +43,7 @@ def test_exact_directions_give_the_rotation(axes):
 
 
 @pytest.mark.parametrize("axes", AXES)
-def test_correction_minimises_equation_3(axes):
+def test_correction_minimizes_equation_3(axes):
     truth, first, second, psi_first, psi_second = noisy_case(0.3)
     i, j = ("xyz".index(axis) for axis in axes)
     first, second = truth[..., i] + first, truth[..., j] + second

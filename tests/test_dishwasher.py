@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from solid_points import deepest_overlap, inside, loose
 
 from caper_jax.categories.dishwasher import DISHWASHER
-from caper_jax.data.synthetic.bank import draw_models
 from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.synthetic.instances import draw_instances
 
 CLOSE = 40  # instances of the tests that look at points
 SHUT = -np.pi / 2
@@ -17,7 +17,7 @@ SHUT = -np.pi / 2
 
 @pytest.fixture(scope="module")
 def models():
-    return draw_models(DISHWASHER, 200, "test", 0)
+    return draw_instances(DISHWASHER, 200, "test", 0)
 
 
 def motion(model, state: float) -> np.ndarray:

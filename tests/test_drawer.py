@@ -7,15 +7,15 @@ import pytest
 from solid_points import deepest_overlap, inside, loose
 
 from caper_jax.categories.drawer import DRAWER
-from caper_jax.data.synthetic.bank import draw_models
 from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.synthetic.instances import draw_instances
 
 CLOSE = 40  # instances of the tests that look at points
 
 
 @pytest.fixture(scope="module")
 def models():
-    return draw_models(DRAWER, 200, "test", 0)
+    return draw_instances(DRAWER, 200, "test", 0)
 
 
 def is_cart(model) -> bool:

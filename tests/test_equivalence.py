@@ -10,21 +10,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
-from caper_jax.articulation.category import Category, Equivalence, Joint
-from caper_jax.articulation.equivalence import is_ambiguous, second_labels, second_reading
+from caper_jax.articulation.category import Category, Joint, Symmetry
 from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.articulation.symmetry import apply_symmetry, is_ambiguous, permute_labels
 from caper_jax.errors import CaperError
 
 DECLARED = [
-    (name, equivalence)
-    for name in categories.names()
-    for equivalence in categories.get(name).equivalences
+    (name, symmetry) for name in categories.names() for symmetry in categories.get(name).symmetries
 ]
 HALF_TURN_Z = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 HALF_TURN_Y = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
 
 
-def made_up(*joints: Joint, equivalence: Equivalence) -> Category:
+def made_up(*joints: Joint, symmetry: Symmetry) -> Category:
     parts = len(joints) + 1
     return Category(
         name="made up",
@@ -35,16 +33,16 @@ def made_up(*joints: Joint, equivalence: Equivalence) -> Category:
         unit=1.0,
         mean_size=((1.0, 1.0, 1.0),) * parts,
         mean_center=((0.0, 0.0, 0.0),) * parts,
-        equivalences=(equivalence,),
+        symmetries=(symmetry,),
     )
 
 
 HINGE = Joint("revolute", 0, (0.0, 1.0))
 SLIDE = Joint("prismatic", 0, (0.0, 1.0))
 # Two side parts change places (as the temples of glasses); a chain read from its other end.
-SIDES = made_up(HINGE, HINGE, equivalence=Equivalence((0, 2, 1), HALF_TURN_Y, ""))
+SIDES = made_up(HINGE, HINGE, symmetry=Symmetry((0, 2, 1), HALF_TURN_Y, ""))
 CHAIN = made_up(
-    HINGE, dataclasses.replace(HINGE, parent=1), equivalence=Equivalence((2, 1, 0), HALF_TURN_Z, "")
+    HINGE, dataclasses.replace(HINGE, parent=1), symmetry=Symmetry((2, 1, 0), HALF_TURN_Z, "")
 )
 
 
@@ -91,15 +89,15 @@ def corners(pose: ArticulatedPose, frame: int, part: int) -> np.ndarray:
 
 
 CASES = [(categories.get(name), e) for name, e in DECLARED] + [
-    (category, category.equivalences[0]) for category in (SIDES, CHAIN)
+    (category, category.symmetries[0]) for category in (SIDES, CHAIN)
 ]
 IDS = [*(name for name, _ in DECLARED), "sides", "chain"]
 
 
-@pytest.mark.parametrize(("category", "equivalence"), CASES, ids=IDS)
-def test_second_reading_is_the_same_object(category, equivalence):
+@pytest.mark.parametrize(("category", "symmetry"), CASES, ids=IDS)
+def test_second_reading_is_the_same_object(category, symmetry):
     pose = random_pose(category)
-    other = second_reading(pose, equivalence, category)
+    other = apply_symmetry(pose, symmetry, category)
     # Forward kinematics from the new root, with the new joints, finds the same parts.
     rotation, translation = kinematics(other, category)
     np.testing.assert_allclose(other.rotation, rotation, atol=1e-12)
@@ -108,35 +106,35 @@ def test_second_reading_is_the_same_object(category, equivalence):
     for frame, part in itertools.product(range(5), range(category.num_parts)):
         np.testing.assert_allclose(
             corners(other, frame, part),
-            corners(pose, frame, equivalence.permutation[part]),
+            corners(pose, frame, symmetry.permutation[part]),
             atol=1e-9,
         )
     # Nothing turns into its opposite: what was open stays as open.
     assert sorted(other.joint_state[0]) == sorted(pose.joint_state[0])
 
 
-@pytest.mark.parametrize(("category", "equivalence"), CASES, ids=IDS)
-def test_second_reading_twice_is_the_first(category, equivalence):
+@pytest.mark.parametrize(("category", "symmetry"), CASES, ids=IDS)
+def test_second_reading_twice_is_the_first(category, symmetry):
     pose = random_pose(category)
-    twice = second_reading(second_reading(pose, equivalence, category), equivalence, category)
+    twice = apply_symmetry(apply_symmetry(pose, symmetry, category), symmetry, category)
     for name, values in vars(pose).items():
         np.testing.assert_allclose(getattr(twice, name), values, atol=1e-12, err_msg=name)
     labels = np.random.default_rng(0).integers(-1, category.num_parts, (3, 7))
-    again = second_labels(second_labels(labels, equivalence), equivalence)
+    again = permute_labels(permute_labels(labels, symmetry), symmetry)
     np.testing.assert_array_equal(again, labels)
 
 
 @pytest.mark.parametrize(
-    ("name", "equivalence"), [pair for pair in DECLARED if pair[0] in ("box", "laptop")]
+    ("name", "symmetry"), [pair for pair in DECLARED if pair[0] in ("box", "laptop")]
 )
-def test_second_readings_of_clamshells_keep_their_conventions(name, equivalence):
+def test_second_readings_of_clamshells_keep_their_conventions(name, symmetry):
     """Hinge along -x (so that positive opens) and behind the middle, in both readings."""
     category = categories.get(name)
     pivot = {"box": (0.0, 0.02, -0.1), "laptop": (0.0, -0.1, -0.12)}[name]
     pose = random_pose(category, frames=1).replace(
         joint_axis=np.array([[[-1.0, 0.0, 0.0]]]), joint_pivot=np.array([[pivot]])
     )
-    other = second_reading(pose, equivalence, category)
+    other = apply_symmetry(pose, symmetry, category)
     np.testing.assert_allclose(other.joint_axis, [[[-1, 0, 0]]], atol=1e-12)
     mirrored = {"box": (0.0, -0.02, -0.1), "laptop": (0.0, -0.12, -0.1)}[name]
     np.testing.assert_allclose(other.joint_pivot, [[mirrored]], atol=1e-12)
@@ -147,19 +145,19 @@ def test_second_reading_keeps_numpy_arrays_and_their_precision():
     pose = random_pose(category)
     for dtype in (np.float32, np.float64):
         cast = ArticulatedPose(**{name: v.astype(dtype) for name, v in vars(pose).items()})
-        other = second_reading(cast, category.equivalences[0], category)
+        other = apply_symmetry(cast, category.symmetries[0], category)
         assert all(type(v) is np.ndarray and v.dtype == dtype for v in vars(other).values())
 
 
 def test_second_labels_name_the_parts_anew():
-    three_cycle = Equivalence((1, 2, 0), HALF_TURN_Z, "")
+    three_cycle = Symmetry((1, 2, 0), HALF_TURN_Z, "")
     # Part k of the second reading is part permutation[k] of the first: old 1 is new 0.
     labels = np.array([[0, 1, 2, -1]])
-    np.testing.assert_array_equal(second_labels(labels, three_cycle), [[2, 0, 1, -1]])
+    np.testing.assert_array_equal(permute_labels(labels, three_cycle), [[2, 0, 1, -1]])
 
 
 def test_is_ambiguous_compares_what_changes_places():
-    (box,), (laptop,) = (categories.get(name).equivalences for name in ("box", "laptop"))
+    (box,), (laptop,) = (categories.get(name).symmetries for name in ("box", "laptop"))
     like = np.array([[0.22, 0.02, 0.09], [0.22, 0.017, 0.09]])
     deep = np.array([[0.22, 0.12, 0.09], [0.22, 0.01, 0.09]])
     np.testing.assert_array_equal(is_ambiguous(np.stack([like, deep]), box), [True, False])
@@ -174,7 +172,7 @@ def test_is_ambiguous_compares_what_changes_places():
 def test_permutations_that_break_the_tree_are_refused():
     pose = random_pose(SIDES)
     with pytest.raises(CaperError, match="joint between parts 1 and 2, which have none"):
-        second_reading(pose, Equivalence((1, 2, 0), HALF_TURN_Z, ""), SIDES)
-    mixed = made_up(HINGE, SLIDE, equivalence=Equivalence((0, 2, 1), HALF_TURN_Y, ""))
+        apply_symmetry(pose, Symmetry((1, 2, 0), HALF_TURN_Z, ""), SIDES)
+    mixed = made_up(HINGE, SLIDE, symmetry=Symmetry((0, 2, 1), HALF_TURN_Y, ""))
     with pytest.raises(CaperError, match=r"'made up'.* prismatic joint of part 2"):
-        second_reading(pose, mixed.equivalences[0], mixed)
+        apply_symmetry(pose, mixed.symmetries[0], mixed)

@@ -75,7 +75,7 @@ def test_pose_is_printed_and_written(files, seen, capsys):
     result = json.loads((files / "pose.json").read_text())
     pose = jax.tree.map(lambda array: array[0], random_pose(1))
     assert result["category"] == "box" and result["parts"] == ["base", "lid"]
-    assert result["units"] == {"length": "metres", "joint_state": ["degrees"]}
+    assert result["units"] == {"length": "meters", "joint_state": ["degrees"]}
     assert "OpenCV" in result["frame"]
     assert result["points"] == {"available": 1999, "dropped": 1, "of_parts": [1021, 3]}
     assert result["hidden"] == [False, True]

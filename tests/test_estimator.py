@@ -18,13 +18,13 @@ from caper_jax import categories
 from caper_jax import estimator as module
 from caper_jax.articulation.category import Joint
 from caper_jax.cli import demo
-from caper_jax.configuration import to_dict
-from caper_jax.data.cloud import cloud_from_depth
+from caper_jax.config import to_dict
+from caper_jax.data.clouds import cloud_from_depth
 from caper_jax.data.images import read_depth, read_intrinsics, read_mask
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, estimate, load, shipped_weights
-from caper_jax.model_files import flatten, write_model
-from caper_jax.networks.canonical import view_rotation
+from caper_jax.geometry.frames import view_rotation
+from caper_jax.models.files import flatten, write_model
 
 BOX = categories.get("box")
 # A door on a cabinet, and a drawer in a drawer: a deeper tree, and lengths beside angles.
@@ -36,7 +36,7 @@ CABINET = dataclasses.replace(
     directions=("y", "z"),
     mean_size=((0.3, 0.3, 0.2), (0.3, 0.2, 0.02), (0.25, 0.05, 0.15)),
     mean_center=((0.0, 0.0, 0.0), (0.0, 0.0, 0.11), (0.0, 0.1, 0.0)),
-    equivalences=(),
+    symmetries=(),
 )
 
 
@@ -79,7 +79,7 @@ def test_poses_follow_the_joints(cabinet):
     assert not found.degenerate.any()
 
 
-def test_lengths_are_metres_whatever_the_network_unit(cabinet):
+def test_lengths_are_meters_whatever_the_network_unit(cabinet):
     """With twice the unit, a cloud of half the size is the same to the networks."""
     double = Estimator(
         dataclasses.replace(
@@ -98,7 +98,7 @@ def test_lengths_are_metres_whatever_the_network_unit(cabinet):
         )
     np.testing.assert_allclose(half.rotation, one.rotation, atol=1e-5)
     np.testing.assert_allclose(half.joint_axis, one.joint_axis, atol=1e-5)
-    states = half.joint_state * np.array([1.0, 2.0])  # radians stay, metres halve
+    states = half.joint_state * np.array([1.0, 2.0])  # radians stay, meters halve
     np.testing.assert_allclose(states, one.joint_state, rtol=1e-4, atol=1e-5)
 
 
@@ -194,10 +194,10 @@ def test_points_without_a_measurement_are_left_out(cabinet):
         (np.zeros((64, 4)), r"points must be \[N, 3\] or \[B, N, 3\], got shape \(64, 4\)"),
         (np.zeros(3), r"got shape \(3,\)"),
         (np.zeros((1, 1, 64, 3)), r"got shape \(1, 1, 64, 3\)"),
-        (clouds(1)[0] * 1000, "millimetres"),
+        (clouds(1)[0] * 1000, "millimeters"),
         (clouds(1)[0] * [1, -1, -1], "behind the camera"),
         ([clouds(1, 20)[0], clouds(1, 30)[0]], "clouds of different sizes one at a time"),
-        (np.full((64, 3), "1.0"), "must be numbers in metres"),
+        (np.full((64, 3), "1.0"), "must be numbers in meters"),
     ],
 )
 def test_bad_clouds_are_named(cabinet, points, message):

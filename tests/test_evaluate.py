@@ -11,13 +11,13 @@ from frames import random_frames
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories, cli
-from caper_jax.data.cloud import sample_points
+from caper_jax.data.clouds import sample_points
 from caper_jax.data.hdf5 import Hdf5Dataset, write
 from caper_jax.errors import CaperError
 from caper_jax.evaluation import protocol, report
 from caper_jax.evaluation.breakdown import by_opening
 from caper_jax.evaluation.metrics import PoseErrors
-from caper_jax.geometry.scan import scan_order
+from caper_jax.geometry.raster_order import raster_order
 
 BOX = categories.get("box")
 FRAMES = 21
@@ -117,10 +117,10 @@ def test_errors_by_opening(path, tmp_path, estimator, capsys):
     places = np.digitize((saved["truth_joint_state"][:, 0] - low) / (high - low), [0.05, 0.25])
     assert set(places) >= {1, 2}
     for number, content in enumerate(metrics["by_opening"]):
-        for part, metres in zip(content["parts"], distance[places == number].T, strict=True):
-            assert part["frames"] == len(metres)
-            if len(metres):
-                assert part["translation_m"]["mean"] == pytest.approx(metres.mean(), rel=1e-4)
+        for part, meters in zip(content["parts"], distance[places == number].T, strict=True):
+            assert part["frames"] == len(meters)
+            if len(meters):
+                assert part["translation_m"]["mean"] == pytest.approx(meters.mean(), rel=1e-4)
     assert "25-100 %" in capsys.readouterr().out
 
 
@@ -304,7 +304,7 @@ def test_frames_that_fail_are_counted_not_dropped(path, tmp_path):
     evaluation = protocol.evaluate(dataset, predictor)
     assert set(calls) == {(protocol.BATCH_SIZE, protocol.NUM_POINTS, 3)}
     assert np.flatnonzero(evaluation.failed).tolist() == [4, 20]
-    result = report.summarise(evaluation, dataset, "model", "here")
+    result = report.summarize(evaluation, dataset, "model", "here")
     assert (result["frames"], result["failures"]) == (FRAMES, 2)
     assert result["parts"][0]["rotation_deg"]["mean"] == pytest.approx(2 * 180 / FRAMES)
     assert result["parts"][0]["turned"] == 2 / FRAMES
@@ -338,7 +338,7 @@ def test_clouds_are_spread_over_all_points(path):
 
     evaluation = protocol.evaluate(dataset, predictor, limit=2, batch_size=2, num_points=500)
     points = dataset[1].points
-    np.testing.assert_array_equal(seen[0][1], points[scan_order(points)][1::3])
+    np.testing.assert_array_equal(seen[0][1], points[raster_order(points)][1::3])
     assert evaluation.names == ["000000", "000001"]
     assert jax.tree.leaves(evaluation.estimate)[0].shape[0] == 2
 

@@ -16,12 +16,12 @@ from quick import quick_jit
 from tiny import network, random_variables
 
 from caper_jax import categories, cli
-from caper_jax.configuration import to_dict
-from caper_jax.data.cloud import sample_points
+from caper_jax.config import to_dict
+from caper_jax.data.clouds import sample_points
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator
 from caper_jax.export import MODEL_FILE, export_estimator, flat
-from caper_jax.model_files import write_model
+from caper_jax.models.files import write_model
 
 # What the runner may not need: finding any of these fails as if it were not installed.
 WITHOUT_THE_PACKAGE = """
@@ -115,7 +115,7 @@ def test_the_manifest_says_what_goes_in_and_comes_out(drawer):
         value = expected[name]
         assert (entry["shape"], entry["dtype"]) == (list(value.shape), value.dtype.name), name
         assert entry["meaning"].count(",", 0, entry["meaning"].index("]")) == value.ndim - 1, name
-    assert manifest["outputs"]["joint_state"]["unit"] == ["metres"] * 3
+    assert manifest["outputs"]["joint_state"]["unit"] == ["meters"] * 3
     assert [part["name"] for part in manifest["parts"]] == list(estimator.category.parts)
     assert [(j["parent"], j["child"], j["type"]) for j in manifest["joints"]] == [
         ("body", f"drawer{i}", "prismatic") for i in (1, 2, 3)

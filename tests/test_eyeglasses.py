@@ -8,15 +8,15 @@ from scipy.spatial.transform import Rotation
 from solid_points import deepest_overlap, inside, loose
 
 from caper_jax import categories
-from caper_jax.data.synthetic.bank import draw_models
 from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.synthetic.instances import draw_instances
 
 SIDES = (-1.0, 1.0)  # of the temples, parts 1 and 2
 
 
 @pytest.fixture(scope="module")
 def glasses():
-    return draw_models(categories.get("eyeglasses"), 200, "train", 3)
+    return draw_instances(categories.get("eyeglasses"), 200, "train", 3)
 
 
 def boxes(model):
@@ -46,7 +46,7 @@ def has_lens(model):
 def test_numbers_keep_their_meaning():
     category = categories.get("eyeglasses")
     assert category.parts == ("frame", "temple at -x", "temple at +x")
-    assert category.directions == ("y", "z") and category.equivalences == ()
+    assert category.directions == ("y", "z") and category.symmetries == ()
     assert category.joint_types == ("revolute", "revolute") and category.parents == (0, 0)
     assert all(joint.limits == (0.0, np.pi / 2) for joint in category.joints)
 

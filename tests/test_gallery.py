@@ -1,4 +1,4 @@
-"""The gallery: a picture of different instances in the parts' colours."""
+"""The gallery: a picture of different instances in the parts' colors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_instances_differ_and_stand_whole_on_white(box):
     assert not np.array_equal(box[0], box[1]) and not np.array_equal(box[1], box[2])
 
 
-def test_parts_have_their_colours(box):
+def test_parts_have_their_colors(box):
     """Shading keeps the ratios of red, green and blue; a box shows both of its parts."""
     pixels = box[(box < 1).any(-1)]
     direction = pixels / np.linalg.norm(pixels, axis=-1, keepdims=True)

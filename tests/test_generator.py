@@ -12,15 +12,15 @@ from quick import quick_jit
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
-from caper_jax.data.synthetic import sensor as sensors
-from caper_jax.data.synthetic.bank import build_bank, draw_models
-from caper_jax.data.synthetic.caster import FAR, cast
-from caper_jax.data.synthetic.config import GeneratorConfig
-from caper_jax.data.synthetic.render import render_image, write_frame
-from caper_jax.data.synthetic.scene import Generator, draw_state_and_poses, systematic
+from caper_jax.config import GeneratorConfig
 from caper_jax.errors import CaperError
-from caper_jax.geometry.scan import grid_scan_order
+from caper_jax.geometry.raster_order import grid_raster_order
 from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.synthetic import sensor as sensors
+from caper_jax.synthetic.frames import Generator, draw_state_and_poses, systematic
+from caper_jax.synthetic.instances import build_bank, draw_instances
+from caper_jax.synthetic.ray_casting import FAR, cast
+from caper_jax.synthetic.render import render_image, write_frame
 
 NAMES = categories.names()
 CLEAN = GeneratorConfig(
@@ -32,7 +32,7 @@ MANY = 1500
 @cache
 def drawn(name):
     """Train instances of a category; the first twelve are those of ``clean``."""
-    return draw_models(categories.get(name), MANY, "train", 0)
+    return draw_instances(categories.get(name), MANY, "train", 0)
 
 
 @pytest.fixture(scope="module", params=NAMES)
@@ -46,7 +46,7 @@ def clean(request):
 
 
 def in_part_frame(batch, labels):
-    """Points in the rest frame of the part they are labelled with, [B, N, 3]."""
+    """Points in the rest frame of the part they are labeled with, [B, N, 3]."""
     rows = np.arange(len(labels))[:, None]
     rotation = batch.pose.rotation[rows, labels]
     offset = batch.points - batch.pose.translation[rows, labels]
@@ -54,7 +54,7 @@ def in_part_frame(batch, labels):
 
 
 def outside_part(batch, labels):
-    """How far points are outside of the box of their part, metres (negative inside), [B, N]."""
+    """How far points are outside of the box of their part, meters (negative inside), [B, N]."""
     rows = np.arange(len(labels))[:, None]
     offset = np.abs(in_part_frame(batch, labels) - batch.pose.box_center[rows, labels])
     return (offset - batch.pose.size[rows, labels] / 2).max(-1)
@@ -118,7 +118,7 @@ def test_points_lie_on_their_part(clean):
 
 def test_picks_follow_one_another_evenly_along_the_scan():
     hit = np.random.default_rng(0).random((64, 64)) < 0.4
-    order = grid_scan_order(64)
+    order = grid_raster_order(64)
     hits = order[hit.ravel()[order]]
     for count in (300, 5000):
         picked = np.asarray(systematic(jax.random.key(0), jnp.asarray(hit), count))
@@ -221,8 +221,8 @@ def test_splits_are_disjoint_and_repeatable(name):
     category = categories.get(name)
     sizes = {}
     for split, seed in (("train", 0), ("val", 0), ("test", 0), ("train", 1)):
-        bank = build_bank(draw_models(category, 20, split, seed))
-        again = build_bank(draw_models(category, 20, split, seed))
+        bank = build_bank(draw_instances(category, 20, split, seed))
+        again = build_bank(draw_instances(category, 20, split, seed))
         assert jax.tree.all(jax.tree.map(np.array_equal, bank, again))
         sizes[split, seed] = {tuple(size.ravel().tolist()) for size in bank.size}
     assert len(set().union(*sizes.values())) == 80
@@ -287,7 +287,7 @@ class TestSensor:
     @pytest.mark.parametrize("distance", [0.4, 1.0, 2.5])
     def test_stereo_noise_is_that_of_its_baseline(self, distance):
         _, points, _, depth, _ = self.wall("realsense", distance=distance)
-        pixel = distance**2 / (640 * 0.05)  # a pixel of disparity, metres
+        pixel = distance**2 / (640 * 0.05)  # a pixel of disparity, meters
         expected = np.hypot(0.08 * pixel, pixel / 32 / np.sqrt(12))
         assert (points[..., 2] - depth).std() == pytest.approx(expected, rel=0.05)
 
@@ -340,11 +340,11 @@ def test_config_refuses_what_makes_no_sense(wrong):
 
 
 def test_rendered_frames_read_back(tmp_path):
-    from caper_jax.data.cloud import cloud_from_depth
+    from caper_jax.data.clouds import cloud_from_depth
     from caper_jax.data.images import read_depth, read_intrinsics, read_mask
 
     category = categories.get("laptop")
-    bank = build_bank(draw_models(category, 1, "test", 3))
+    bank = build_bank(draw_instances(category, 1, "test", 3))
     instance = jax.tree.map(lambda values: jnp.asarray(values[0]), bank)
     image = render_image(jax.random.key(2), instance, category, "none", 320, 240)
     assert (image.parts >= 0).sum() > 300
@@ -358,4 +358,4 @@ def test_rendered_frames_read_back(tmp_path):
     pose = image.pose
     local = np.einsum("nji,nj->ni", pose.rotation[labels], cloud.points - pose.translation[labels])
     outside = np.abs(local - pose.box_center[labels]) - pose.size[labels] / 2
-    assert outside.max() < 0.0011  # depth is rounded to millimetres
+    assert outside.max() < 0.0011  # depth is rounded to millimeters

@@ -1,4 +1,4 @@
-"""Neighbourhoods and neighbour maxima: against numpy, finite differences and dense JAX."""
+"""Neighborhoods and neighbor maxima: against numpy, finite differences and dense JAX."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from caper_jax.networks import graph
-from caper_jax.networks.graph import (
+from caper_jax.models.encoders.neighbors import (
     directional_max,
     directions,
     gather,
     nearest,
     nearest_row,
-    neighbour_max,
+    neighbor_max,
     squared_distances,
 )
 
@@ -70,7 +69,7 @@ def test_nearest_of_another_cloud():
 
 @pytest.mark.parametrize("count", [4 * 8, 4 * 8 + 3])  # whole blocks, and not
 @pytest.mark.parametrize("channels", [3, 6])
-def test_neighbours_in_blocks_are_the_same(monkeypatch, channels, count):
+def test_neighbors_in_blocks_are_the_same(monkeypatch, channels, count):
     points, queries = random(2, count, channels), random(2, 11, channels, seed=1)
     points[:, 9] = points[:, 20]  # twins in different blocks
 
@@ -83,8 +82,8 @@ def test_neighbours_in_blocks_are_the_same(monkeypatch, channels, count):
         )
 
     at_once = jax.jit(all_of)(points, queries)
-    monkeypatch.setattr(graph, "BLOCK_ABOVE", 10)
-    monkeypatch.setattr(graph, "_BLOCK", 8)
+    monkeypatch.setattr("caper_jax.models.encoders.neighbors.BLOCK_ABOVE", 10)
+    monkeypatch.setattr("caper_jax.models.encoders.neighbors._BLOCK", 8)
     in_blocks = jax.jit(lambda *clouds: all_of(*clouds))(points, queries)
     jax.tree.map(np.testing.assert_array_equal, in_blocks, at_once)
 
@@ -97,7 +96,7 @@ def test_neighbours_in_blocks_are_the_same(monkeypatch, channels, count):
     np.testing.assert_array_equal(in_blocks, jax.jit(jax.grad(lambda x: total(x)))(points[..., :3]))
 
 
-def test_many_neighbours_take_no_square_of_memory():
+def test_many_neighbors_take_no_square_of_memory():
     """Of 16,384 points: all distances at once would be 1 GiB."""
     points = jax.ShapeDtypeStruct((1, 16384, 3), jnp.float32)
     compiled = jax.jit(lambda x: nearest(x, x, 20, exclude_self=True)).lower(points).compile()
@@ -116,7 +115,7 @@ def test_ties_go_to_the_lower_row():
     )
 
 
-def test_a_repeated_point_is_a_neighbour_of_its_twin_but_never_of_itself():
+def test_a_repeated_point_is_a_neighbor_of_its_twin_but_never_of_itself():
     points = np.repeat(random(1, 10, 3), 2, axis=1)
     index = np.asarray(nearest(points, points, 3, exclude_self=True))[0]
     np.testing.assert_array_equal(index[:, 0], np.arange(20) ^ 1)
@@ -198,18 +197,18 @@ def dense_directional_max(direction, index, features, weights):
     return theta.max(2)
 
 
-def layer_inputs(seed=0, neighbours=K):
+def layer_inputs(seed=0, neighbors=K):
     rng = np.random.default_rng(seed)
-    direction = rng.normal(size=(B, N, neighbours, 3))
+    direction = rng.normal(size=(B, N, neighbors, 3))
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    index = np.argsort(rng.random((B, N, N)), -1)[..., :neighbours]
+    index = np.argsort(rng.random((B, N, N)), -1)[..., :neighbors]
     return direction, index, rng.normal(size=(B, N, C)), rng.normal(size=(3, C))
 
 
-@pytest.mark.parametrize(("surface", "neighbours"), [(True, K), (False, K), (False, 1)])
-def test_directional_max_and_its_gradients(surface, neighbours):
-    direction, index, features, weights = layer_inputs(neighbours=neighbours)
-    direction[0, 0, 0] = 0.0  # a coincident neighbour
+@pytest.mark.parametrize(("surface", "neighbors"), [(True, K), (False, K), (False, 1)])
+def test_directional_max_and_its_gradients(surface, neighbors):
+    direction, index, features, weights = layer_inputs(neighbors=neighbors)
+    direction[0, 0, 0] = 0.0  # a coincident neighbor
     arguments = {"direction": direction, "weights": weights}
     if not surface:
         arguments["features"] = features
@@ -233,8 +232,8 @@ def test_directional_max_and_its_gradients(surface, neighbours):
         one, other = compare(arguments)
         jax.tree.map(partial(np.testing.assert_allclose, atol=1e-13), one, other)
         slopes = difference_quotient(lambda at: compare(at)[0][0][0], arguments, one[1])
-        # The coincident neighbour stands on the kink of the relu.
-        if neighbours > 1:
+        # The coincident neighbor stands on the kink of the relu.
+        if neighbors > 1:
             np.testing.assert_allclose(*slopes, rtol=1e-6)
 
 
@@ -252,8 +251,8 @@ def test_slopes_have_the_types_of_what_they_belong_to():
     assert [slope.dtype for slope in slopes] == [np.float64, np.float32, np.float32]
 
 
-def test_directional_max_with_the_most_neighbours():
-    """The winner's number is a uint8: the 256th neighbour still counts."""
+def test_directional_max_with_the_most_neighbors():
+    """The winner's number is a uint8: the 256th neighbor still counts."""
     direction = np.tile(np.float32([0, 0, 0.5]), (1, 1, 256, 1))
     direction[0, 0, 255] = [0, 0, 1.0]
     weights = np.float32([[0], [0], [1]])
@@ -265,7 +264,7 @@ def test_directional_max_with_the_most_neighbours():
     assert gradient[0, 255, 0] == 1.0 and gradient.sum() == 1.0
 
 
-def test_neighbour_max_and_its_gradient():
+def test_neighbor_max_and_its_gradient():
     _, index, features, _ = layer_inputs()
     index = index[:, : N // 2]  # fewer queries than rows, as in pooling
     index[0, 0] = 7  # the same row five times
@@ -283,7 +282,7 @@ def test_neighbour_max_and_its_gradient():
 
     @jax.jit
     def compare(features):
-        return both(neighbour_max, features), both(dense, features)
+        return both(neighbor_max, features), both(dense, features)
 
     with jax.enable_x64(True):
         one, other = compare(features)
@@ -298,7 +297,7 @@ def test_a_tie_sends_its_gradient_to_one_winner():
     direction = jnp.tile(jnp.asarray([0.0, 0.0, 1.0]), (1, 1, 3, 1))
     weights = jnp.asarray([[0.0], [0.0], [1.0]])
     reductions = (
-        lambda f: neighbour_max(f, index).sum(),
+        lambda f: neighbor_max(f, index).sum(),
         lambda f: directional_max(direction, index, f, weights).sum(),
     )
     for total in reductions:
@@ -314,7 +313,7 @@ def test_vmap_equals_one_by_one():
     def both(direction, index, features, weights):
         def total(direction, features, weights):
             value = directional_max(direction, index, features, weights)
-            return (neighbour_max(value, index) ** 2).sum()
+            return (neighbor_max(value, index) ** 2).sum()
 
         return jax.value_and_grad(total, (0, 1, 2))(direction, features, weights)
 

@@ -9,9 +9,9 @@ from frames import random_frames
 
 from caper_jax import categories
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data import open_dataset
 from caper_jax.data.hdf5 import Hdf5Dataset, check_writable, write
-from caper_jax.data.schema import Frame, pose_shapes, validate
+from caper_jax.data.readers import open_dataset
+from caper_jax.data.types import Frame, pose_shapes, validate
 from caper_jax.errors import CaperError
 
 BOX = categories.get("box")
@@ -24,7 +24,7 @@ def write_box(path, **changes):
     return arguments
 
 
-def test_everything_comes_back_to_a_hundredth_of_a_millimetre(tmp_path):
+def test_everything_comes_back_to_a_hundredth_of_a_millimeter(tmp_path):
     path = tmp_path / "box_test.h5"
     written = write_box(path, attributes={"noise": "realsense", "seed": 7})
     dataset = open_dataset("caper", path, "box", "test")
@@ -237,7 +237,7 @@ def test_validate_names_every_problem_at_once():
         (lambda t: t.replace(rotation=t.rotation * [1, 1, -1]), "rotation is a reflection"),
         (lambda t: t.replace(joint_state=-t.joint_state), "pose of part 'lid' is not the one"),
         (lambda t: t.replace(joint_state=np.degrees(t.joint_state)), "sign and unit"),
-        (lambda t: t.replace(translation=1000 * t.translation), "millimetres"),
+        (lambda t: t.replace(translation=1000 * t.translation), "millimeters"),
         (lambda t: t.replace(joint_pivot=t.joint_pivot + 0.02), "axis and pivot are in the root"),
         (lambda t: t.replace(size=t.size[:1]), r"size has shape \(1, 3\), expected \(2, 3\)"),
         (lambda t: t.replace(size=t.size.astype(int)), "expected a float array"),
@@ -255,7 +255,7 @@ def test_validate_understands_poses(change, message):
     [
         ({"points": np.zeros((0, 3), np.float32)}, r"points has shape \(0, 3\)"),
         ({"points": np.full((POINTS, 3), np.inf, np.float32)}, r"points has NaN.*at \[0, 0\]"),
-        ({"points": np.full((POINTS, 3), 800, np.float32)}, "are they in millimetres"),
+        ({"points": np.full((POINTS, 3), 800, np.float32)}, "are they in millimeters"),
         ({"labels": np.zeros(3, np.int32)}, r"labels has shape \(3,\)"),
         ({"labels": np.zeros(POINTS)}, "labels is float64, expected int32"),
         ({"visible": np.zeros(3, int)}, r"visible has shape \(3,\)"),

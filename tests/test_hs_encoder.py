@@ -12,12 +12,12 @@ import pytest
 from tiny import HS, random_like
 
 from caper_jax import categories
-from caper_jax.networks.caper import PartsNetwork, RootNetwork
-from caper_jax.networks.hs_encoder import HSEncoder, HSEncoderConfig, neighbourhoods
-from caper_jax.networks.presets import preset
+from caper_jax.config import HSEncoderConfig, preset
+from caper_jax.models.encoders.hs import HSEncoder, neighborhoods
+from caper_jax.models.networks import PartsNetwork, RootNetwork
 
 
-def neighbours(points, k):
+def neighbors(points, k):
     """[N, k] nearest others, by sorting."""
     distance = ((points[:, None] - points[None]) ** 2).sum(-1)
     np.fill_diagonal(distance, np.inf)
@@ -25,7 +25,7 @@ def neighbours(points, k):
 
 
 def hs_layer(params, points, features, scope, around, supports):
-    """One cloud: mean over the supports of max over neighbours of relu(d . W) f, then ORL, + STE.
+    """One cloud: mean over the supports of max over neighbors of relu(d . W) f, then ORL, + STE.
 
     ``features`` is None in the surface layer, where f = 1 and the skip (STE) sees the points.
     """
@@ -60,7 +60,7 @@ def hs_encoder(variables, points, config):
     def layer(number, points, features, around):
         k = around.shape[1]
         in_features = config.feature_space and features is not None
-        scope = neighbours(features, k) if in_features else around
+        scope = neighbors(features, k) if in_features else around
         name = f"layer{number}"
         return hs_layer(params[name], points, features, scope, around, config.supports)
 
@@ -70,15 +70,15 @@ def hs_encoder(variables, points, config):
     def pool(points, features, around):
         return points[::4], features[around[:, :4]].max(1)[::4]
 
-    around = neighbours(points, 4)  # min(20, 64 / 8), here min(4, 8)
+    around = neighbors(points, 4)  # min(20, 64 / 8), here min(4, 8)
     f0 = np.maximum(layer(0, points, None, around), 0)
     f1 = norm_relu(layer(1, points, f0, around), 1)
     points1, pooled = pool(points, f1, around)
-    around = neighbours(points1, 2)  # min(4, 16 / 8)
+    around = neighbors(points1, 2)  # min(4, 16 / 8)
     f2 = norm_relu(layer(2, points1, pooled, around), 2)
     f3 = norm_relu(layer(3, points1, f2, around), 3)
     points2, pooled = pool(points1, f3, around)
-    f4 = layer(4, points2, pooled, neighbours(points2, 1))
+    f4 = layer(4, points2, pooled, neighbors(points2, 1))
     levels = (np.concatenate([f0, f1], -1), np.concatenate([f2, f3], -1), f4)
     return levels, (closest(points1), closest(points2)), f4.max(0)
 
@@ -154,9 +154,9 @@ def test_published_sizes():
 
 
 @pytest.mark.parametrize(("points", "expected"), [(1024, (20, 20, 8)), (512, (20, 16, 4))])
-def test_neighbours_shrink_with_the_cloud(monkeypatch, points, expected):
+def test_neighbors_shrink_with_the_cloud(monkeypatch, points, expected):
     """20 at full resolution, at most an eighth of the points after pooling: 20, 20, 8."""
-    from caper_jax.networks import hs_encoder as module
+    from caper_jax.models.encoders import hs as module
 
     asked = []
 
@@ -174,7 +174,7 @@ def test_parameter_count_of_the_paper_preset():
 
     def hs(before, channels, norm):
         own = 3 * 7 * channels + before * channels  # directions and STE
-        own += (before + 1) * 8 * channels if before > 3 else 0  # centre and 7 supports
+        own += (before + 1) * 8 * channels if before > 3 else 0  # center and 7 supports
         return own + 2 * channels * channels + 2 * channels * norm  # ORL, batch norm
 
     def dense(before, channels, norm):
@@ -202,11 +202,11 @@ def test_parameter_count_of_the_paper_preset():
     assert 13e6 < parts < 14e6
 
 
-def test_neighbourhoods_serve_every_pose_of_the_cloud():
+def test_neighborhoods_serve_every_pose_of_the_cloud():
     cloud = np.random.default_rng(1).normal(size=(2, 64, 3)).astype(np.float32)
     turn = np.float32([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])
-    space = jax.jit(lambda x: neighbourhoods(x, HS))(cloud)
-    moved = jax.jit(lambda x: neighbourhoods(x, HS))(cloud @ turn + 2.0)
+    space = jax.jit(lambda x: neighborhoods(x, HS))(cloud)
+    moved = jax.jit(lambda x: neighborhoods(x, HS))(cloud @ turn + 2.0)
     jax.tree.map(np.testing.assert_array_equal, space, moved)
     assert [a.shape for a in space.around] == [(2, 64, 4), (2, 16, 2), (2, 4, 1)]
     module = HSEncoder(HS)

@@ -18,37 +18,37 @@ def save(path, array):
     return path
 
 
-def test_integer_depth_is_millimetres(tmp_path):
-    millimetres = np.array([[0, 1234], [65535 // 2, 700]], np.uint16)
-    png = read_depth(save(tmp_path / "d.png", millimetres))
+def test_integer_depth_is_millimeters(tmp_path):
+    millimeters = np.array([[0, 1234], [65535 // 2, 700]], np.uint16)
+    png = read_depth(save(tmp_path / "d.png", millimeters))
     assert png.dtype == np.float32 and png.shape == (2, 2)
-    np.testing.assert_allclose(png, millimetres / 1000, rtol=1e-6)
-    np.testing.assert_array_equal(png, read_depth(save(tmp_path / "d.npy", millimetres)))
+    np.testing.assert_allclose(png, millimeters / 1000, rtol=1e-6)
+    np.testing.assert_array_equal(png, read_depth(save(tmp_path / "d.npy", millimeters)))
 
 
-def test_float_depth_is_metres_and_keeps_gaps(tmp_path):
-    metres = np.array([[np.nan, 1.25], [np.inf, 0.5]], np.float64)
+def test_float_depth_is_meters_and_keeps_gaps(tmp_path):
+    meters = np.array([[np.nan, 1.25], [np.inf, 0.5]], np.float64)
     np.testing.assert_array_equal(
-        read_depth(save(tmp_path / "d.npy", metres)), metres.astype(np.float32)
+        read_depth(save(tmp_path / "d.npy", meters)), meters.astype(np.float32)
     )
-    tiff = read_depth(save(tmp_path / "d.tif", metres.astype(np.float32)))
-    np.testing.assert_array_equal(tiff, metres.astype(np.float32))
+    tiff = read_depth(save(tmp_path / "d.tif", meters.astype(np.float32)))
+    np.testing.assert_array_equal(tiff, meters.astype(np.float32))
 
 
 def test_three_channel_depth_is_read_as_artimage_writes_it(tmp_path):
-    millimetres = np.array([[0, 300], [4660, 1]], np.uint16)
-    bgr = np.stack([np.zeros_like(millimetres), millimetres >> 8, millimetres & 255], -1)
+    millimeters = np.array([[0, 300], [4660, 1]], np.uint16)
+    bgr = np.stack([np.zeros_like(millimeters), millimeters >> 8, millimeters & 255], -1)
     path = save(tmp_path / "d.png", bgr[..., ::-1].astype(np.uint8))
-    np.testing.assert_allclose(read_depth(path), millimetres / 1000, rtol=1e-6)
+    np.testing.assert_allclose(read_depth(path), millimeters / 1000, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["photo.jpg", "photo.png", "grey.png"])
+@pytest.mark.parametrize("name", ["photo.jpg", "photo.png", "gray.png"])
 def test_pictures_are_no_depth(tmp_path, name):
-    colours = np.random.default_rng(0).integers(1, 200, (16, 16, 3)).astype(np.uint8)
-    if name.startswith("grey"):
-        colours[...] = colours[..., :1]
+    colors = np.random.default_rng(0).integers(1, 200, (16, 16, 3)).astype(np.uint8)
+    if name.startswith("gray"):
+        colors[...] = colors[..., :1]
     path = tmp_path / name
-    Image.fromarray(colours).save(path, "JPEG" if name.startswith("photo") else "PNG")
+    Image.fromarray(colors).save(path, "JPEG" if name.startswith("photo") else "PNG")
     with pytest.raises(CaperError, match=rf"{name}: looks like a picture, not depth"):
         read_depth(path)
 
@@ -69,10 +69,10 @@ def test_depth_scale_overrides_the_unit(tmp_path):
 @pytest.mark.parametrize(
     ("name", "array", "message"),
     [
-        ("d.png", np.full((4, 4), 2, np.uint16), "seem to be whole metres"),
+        ("d.png", np.full((4, 4), 2, np.uint16), "seem to be whole meters"),
         ("d.png", np.full((4, 4), 60000, np.uint16), "finer or no depth at all"),
-        ("d.npy", np.full((4, 4), 812.0), "seem to be millimetres: give the scale 0.001"),
-        ("d.npy", np.full((4, 4), 1e-3), "floats are read as metres, these are not"),
+        ("d.npy", np.full((4, 4), 812.0), "seem to be millimeters: give the scale 0.001"),
+        ("d.npy", np.full((4, 4), 1e-3), "floats are read as meters, these are not"),
         ("d.png", np.full((4, 4), 90, np.uint8), "uint8 image of shape"),
         ("d.npy", np.ones((4, 4, 2), np.float32), "holds no depth"),
     ],
@@ -113,8 +113,8 @@ def test_mask_is_whatever_is_not_black(tmp_path, value):
 
 @pytest.mark.parametrize("suffix", ["png", "gif"])
 @pytest.mark.parametrize("white_first", [False, True])
-def test_black_in_a_palette_is_a_colour_not_a_number(tmp_path, suffix, white_first):
-    """PIL's quantize puts the commonest colour first, and that may be white."""
+def test_black_in_a_palette_is_a_color_not_a_number(tmp_path, suffix, white_first):
+    """PIL's quantize puts the commonest color first, and that may be white."""
     expected = np.zeros((4, 5), bool)
     expected[1:3, 2:] = True
     image = Image.new("P", (5, 4))

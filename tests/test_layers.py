@@ -13,9 +13,10 @@ from flax.errors import FlaxError
 from quick import quick_jit
 from tiny import random_like
 
+from caper_jax.config import FastEncoderConfig
 from caper_jax.errors import CaperError
-from caper_jax.networks.fast_encoder import FastEncoder, FastEncoderConfig
-from caper_jax.networks.layers import BatchNorm, Dense, Weights, max_over_points
+from caper_jax.models.encoders.fast import FastEncoder
+from caper_jax.models.layers import BatchNorm, Dense, Weights, max_over_points
 
 POINTS = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
 
@@ -104,7 +105,7 @@ def test_maximum_over_points_has_the_value_and_slopes_of_jax():
 
 
 def test_slopes_are_finite_where_the_compiler_rounds_maxima_twice():
-    """Unoptimised, XLA computes the features once for their maximum and again for its slope."""
+    """Unoptimized, XLA computes the features once for their maximum and again for its slope."""
     config = FastEncoderConfig(16, 16, scales=(0.2, 0.4), width=8, blocks=1, last=8)
     encoder = FastEncoder(config)
     points = np.random.default_rng(4).normal(size=(1, 64, 3)).astype(np.float32)

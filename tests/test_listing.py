@@ -3,8 +3,8 @@
 import pytest
 from formats import FORMATS, write_root
 
-from caper_jax.data import open_dataset, splits_in
-from caper_jax.data.listing import list_splits, natural_order, read_list
+from caper_jax.data.readers import open_dataset, splits_in
+from caper_jax.data.readers.listing import list_splits, natural_order, read_list
 from caper_jax.errors import CaperError
 
 

@@ -12,8 +12,9 @@ import pytest
 from frames import random_frames
 
 from caper_jax import categories
-from caper_jax.data.loader import Loader, LoaderConfig
-from caper_jax.data.schema import Frame
+from caper_jax.config import LoaderConfig
+from caper_jax.data.loader import Loader
+from caper_jax.data.types import Frame
 from caper_jax.errors import CaperError
 
 FRAMES, POINTS = 10, 40

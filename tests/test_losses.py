@@ -164,7 +164,7 @@ def test_direction_and_scale_are_mean_absolute_differences():
         np.testing.assert_allclose(loss(one, other), expected, rtol=1e-6)
 
 
-def test_segmentation_is_cross_entropy_without_unlabelled_points():
+def test_segmentation_is_cross_entropy_without_unlabeled_points():
     logits = normal(2, 5, 3)
     labels = np.array([[0, 1, 2, -1, -1], [2, 2, -1, 0, 1]])
     odds = np.exp(logits)

@@ -13,12 +13,12 @@ import pytest
 from quick import quick_jit
 
 from caper_jax import categories
-from caper_jax.data.synthetic import masks
-from caper_jax.data.synthetic.bank import build_bank, draw_models
-from caper_jax.data.synthetic.caster import FAR
-from caper_jax.data.synthetic.config import GeneratorConfig
-from caper_jax.data.synthetic.scene import Generator
-from caper_jax.data.synthetic.surroundings import add_clutter, spill_on_table, table_depth
+from caper_jax.config import GeneratorConfig
+from caper_jax.synthetic import masks
+from caper_jax.synthetic.frames import Generator
+from caper_jax.synthetic.instances import build_bank, draw_instances
+from caper_jax.synthetic.ray_casting import FAR
+from caper_jax.synthetic.surroundings import add_clutter, spill_on_table, table_depth
 
 SIDE, KEYS = 64, 300
 ROWS, COLUMNS = np.indices((SIDE, SIDE))
@@ -113,7 +113,7 @@ def test_missing_pixels_and_holes():
 
 def test_the_table_touches_the_object_from_below():
     category = categories.get("laptop")
-    bank = build_bank(draw_models(category, 1, "train", 0))
+    bank = build_bank(draw_instances(category, 1, "train", 0))
     instance = jax.tree.map(lambda values: values[0], bank)
     # Seen from 40 deg above, 1.5 m away; the lid leans back below the base.
     angle, lean = np.radians(40), np.radians(-100)
@@ -217,7 +217,7 @@ def draw(config):
 
 
 def outside_part(batch, points):
-    """How far points are outside of the box of their part, metres (negative inside), [B, N]."""
+    """How far points are outside of the box of their part, meters (negative inside), [B, N]."""
     labels = np.maximum(batch.labels, 0)
     rows = np.arange(len(labels))[:, None]
     offset = points - batch.pose.translation[rows, labels]

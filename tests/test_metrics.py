@@ -10,10 +10,10 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
-from caper_jax.articulation.category import Category, Equivalence, Joint
-from caper_jax.articulation.equivalence import second_reading
+from caper_jax.articulation.category import Category, Joint, Symmetry
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.schema import pose_problems
+from caper_jax.articulation.symmetry import apply_symmetry
+from caper_jax.data.types import pose_problems
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.metrics import pose_errors, pose_errors_up_to_symmetry
 
@@ -74,7 +74,7 @@ def test_full_iou_is_that_of_the_oriented_boxes_in_the_camera():
             middle = rotation @ pose.box_center[frame, part] + pose.translation[frame, part]
             planes.append(halfspaces(rotation, middle, pose.size[frame, part]))
             volumes.append(np.prod(pose.size[frame, part], dtype=float))
-        inside = middle  # the true centre is well inside both boxes
+        inside = middle  # the true center is well inside both boxes
         corners = HalfspaceIntersection(np.concatenate(planes), inside).intersections
         shared = ConvexHull(corners).volume
         assert found[frame, part] == pytest.approx(shared / (sum(volumes) - shared), abs=1e-5)
@@ -156,7 +156,7 @@ def mixed(chosen, first, second):
     )
 
 
-def test_prismatic_joints_have_no_pivot_and_states_in_metres():
+def test_prismatic_joints_have_no_pivot_and_states_in_meters():
     truth = chain_pose(TURN_AND_SLIDE)
     guess = truth.replace(joint_state=truth.joint_state + 0.01, joint_pivot=truth.joint_pivot + 1)
     errors = pose_errors(guess, truth, TURN_AND_SLIDE)
@@ -203,30 +203,30 @@ CYCLE = ((0, 0, 1), (-1, 0, 0), (0, -1, 0))
 
 
 @pytest.mark.parametrize(
-    ("category", "pose", "equivalence"),
+    ("category", "pose", "symmetry"),
     [
-        (BOX, random_pose(FRAMES), BOX.equivalences[0]),
+        (BOX, random_pose(FRAMES), BOX.symmetries[0]),
         # The chain read from its other end: parents and children change places.
-        (TURN_TWICE, chain_pose(TURN_TWICE), Equivalence((2, 1, 0), CYCLE, "test")),
+        (TURN_TWICE, chain_pose(TURN_TWICE), Symmetry((2, 1, 0), CYCLE, "test")),
     ],
 )
-def test_a_second_reading_is_the_same_object(category, pose, equivalence):
-    reading = second_reading(pose, equivalence, category)
+def test_a_second_reading_is_the_same_object(category, pose, symmetry):
+    reading = apply_symmetry(pose, symmetry, category)
     assert not pose_problems(reading, category)
-    found, expected = corners(reading), corners(pose)[:, list(equivalence.permutation)]
+    found, expected = corners(reading), corners(pose)[:, list(symmetry.permutation)]
     distance = np.linalg.norm(found[..., :, None, :] - expected[..., None, :, :], axis=-1)
     assert distance.min(-1).max() < 1e-6 and distance.min(-2).max() < 1e-6
 
 
 def alike(size):
     """Extents [F, 3] of the box's other part with which both may change places."""
-    return size @ np.abs(np.array(BOX.equivalences[0].turn))
+    return size @ np.abs(np.array(BOX.symmetries[0].turn))
 
 
 def test_errors_up_to_symmetry_take_the_better_reading_of_each_frame():
     truth = random_pose(FRAMES)
     truth.size[:, 1] = alike(truth.size[:, 0])
-    other = second_reading(truth, BOX.equivalences[0], BOX)
+    other = apply_symmetry(truth, BOX.symmetries[0], BOX)
     swapped = np.arange(FRAMES) % 3 == 0
     guess = mixed(swapped, other, truth)
     guess = turned(guess, [0.02, 0, 0], (0, 0.001, 0))
@@ -241,11 +241,11 @@ def test_errors_up_to_symmetry_take_the_better_reading_of_each_frame():
 
 
 def test_parts_that_are_not_alike_may_not_change_places():
-    (equivalence,) = BOX.equivalences
+    (symmetry,) = BOX.symmetries
     pose = random_pose(40)
     pose.size[:, 1] = alike(pose.size[:, 0])
     pose.size[20:, 1] *= 2
-    guess = second_reading(pose, equivalence, BOX)
+    guess = apply_symmetry(pose, symmetry, BOX)
     plain, symmetric = (f(guess, pose, BOX) for f in (pose_errors, pose_errors_up_to_symmetry))
     assert symmetric.rotation_deg[:20].max() < 1e-3
     np.testing.assert_array_equal(symmetric.rotation_deg[20:], plain.rotation_deg[20:])
@@ -258,7 +258,7 @@ def test_impossible_symmetries_and_shapes_are_named():
         ((2, 1, 0), "puts the prismatic joint of part 2 where a revolute one belongs"),
     ):
         with pytest.raises(CaperError, match=message):
-            second_reading(pose, Equivalence(order, same, ""), TURN_AND_SLIDE)
+            apply_symmetry(pose, Symmetry(order, same, ""), TURN_AND_SLIDE)
     with pytest.raises(CaperError, match="estimate rotation has shape"):
         pose_errors(random_pose(FRAMES), pose, TURN_AND_SLIDE)
     with pytest.raises(CaperError, match=r"shape \(3, 3, 3, 3\), expected \(12, 3, 3, 3\)"):

@@ -12,14 +12,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny import network, random_like
 
+from caper_jax.config import PRESETS, FastEncoderConfig, HeadConfig, preset
 from caper_jax.errors import CaperError
-from caper_jax.networks.canonical import canonicalise, rotate, view_rotation
-from caper_jax.networks.caper import PartsNetwork, RootNetwork
-from caper_jax.networks.fast_encoder import FastEncoder, FastEncoderConfig, local_moments
-from caper_jax.networks.features import BlockDense, Features, Level
-from caper_jax.networks.heads import HeadConfig, PointHead, PooledHead, unit_vectors
-from caper_jax.networks.presets import PRESETS, preset
-from caper_jax.networks.voting import vote
+from caper_jax.geometry.frames import canonicalize, rotate, view_rotation
+from caper_jax.models.encoders.fast import FastEncoder, local_moments
+from caper_jax.models.encoders.features import BlockDense, Features, Level
+from caper_jax.models.heads import PointHead, PooledHead, unit_vectors
+from caper_jax.models.networks import PartsNetwork, RootNetwork
+from caper_jax.models.voting import vote
 
 
 def normal(*shape, seed=0):
@@ -220,11 +220,11 @@ def test_view_rotation_of_clouds_around_and_behind_the_camera():
     np.testing.assert_array_equal(view, np.tile(np.eye(3), (5, 1, 1)))
 
 
-def test_canonicalise_inverts_the_pose():
+def test_canonicalize_inverts_the_pose():
     rotation = Rotation.random(3, rng=np.random.default_rng(0)).as_matrix().astype(np.float32)
     canonical, translation = normal(3, 10, 3), normal(3, 3, seed=1)
     camera = np.einsum("bij,bnj->bni", rotation, canonical) + translation[:, None]
-    result = canonicalise(*map(jnp.asarray, (camera, rotation, translation)))
+    result = canonicalize(*map(jnp.asarray, (camera, rotation, translation)))
     np.testing.assert_allclose(result, canonical, atol=1e-6)
     np.testing.assert_allclose(
         rotate(jnp.asarray(rotation), jnp.asarray(result)) + translation[:, None], camera, atol=1e-6
@@ -236,7 +236,7 @@ def test_local_moments_are_weighted_means_and_covariances():
     scale = np.array([0.5, 0.8])
     with jax.enable_x64(True):
         result = np.asarray(local_moments(*map(jnp.asarray, (centers, points, scale))))
-        unit = 7.0 * np.ones(2)  # network units per metre, say
+        unit = 7.0 * np.ones(2)  # network units per meter, say
         scaled = local_moments(*map(jnp.asarray, (7 * centers, 7 * points, unit * scale)))
     for b in range(2):
         for m in range(5):
@@ -257,9 +257,9 @@ def test_local_moments_are_weighted_means_and_covariances():
 
 
 @pytest.mark.parametrize("count", [90, 100, 127, 128])
-def test_centres_are_spread_over_every_cloud(count):
-    """On a line no centre is nearest to more than its share of the points."""
-    config = FastEncoderConfig(centers_in_use=64, scales=(0.002,), width=4, blocks=1, last=4)
+def test_centers_are_spread_over_every_cloud(count):
+    """On a line no center is nearest to more than its share of the points."""
+    config = FastEncoderConfig(eval_centers=64, scales=(0.002,), width=4, blocks=1, last=4)
     module = FastEncoder(config)
     points = jnp.arange(count * 1.0)[None, :, None] * jnp.array([1.0, 0.0, 0.0])
     output = module.apply(variables_of(module, points), points, train=False)
@@ -267,14 +267,12 @@ def test_centres_are_spread_over_every_cloud(count):
     assert shares.min() >= 1 and shares.max() <= 2
 
 
-def test_fast_encoder_interpolates_its_centres():
-    config = FastEncoderConfig(
-        centers=8, centers_in_use=16, scales=(0.1,), width=4, blocks=1, last=4
-    )
+def test_fast_encoder_interpolates_its_centers():
+    config = FastEncoderConfig(centers=8, eval_centers=16, scales=(0.1,), width=4, blocks=1, last=4)
     module = FastEncoder(config)
     for count, train, centers in (
         *((64, True, 8), (64, False, 16)),
-        (10, False, 10),  # fewer points than centres: all of them
+        (10, False, 10),  # fewer points than centers: all of them
     ):
         points = normal(2, count, 3)
         shapes = jax.eval_shape(

@@ -106,7 +106,7 @@ def test_ranger_equals_the_published_algorithm():
         got = run(Optimizer("ranger", learning_rate=0.05), params, gradients, factors)
     assert_close(training_weights(got), fast, 1e-10)
     assert_close(evaluation_weights(got), slow, 1e-10)
-    # 20 steps end between two synchronisations: the two sets of weights must differ.
+    # 20 steps end between two synchronizations: the two sets of weights must differ.
     assert not np.allclose(fast["kernel"], slow["kernel"], atol=1e-3)
 
 
@@ -127,7 +127,7 @@ def test_adamw_equals_the_published_algorithm():
     assert_close(got, adamw_reference(params, gradients, 0.05 * factors, 0.1), 1e-10)
 
 
-def test_gradients_are_centred_over_all_axes_but_the_output():
+def test_gradients_are_centered_over_all_axes_but_the_output():
     rng = np.random.default_rng(3)
     gradient = {"kernel": rng.normal(size=(5, 4, 3)) + 7, "bias": rng.normal(size=3) + 7}
     transformation = centralize_gradients()

@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from caper_jax.config import TrainingConfig
 from caper_jax.errors import CaperError
 from caper_jax.training import parallel
-from caper_jax.training.loop import TrainingConfig, fit
+from caper_jax.training.loop import fit
 from caper_jax.training.metrics_log import read_metrics
 from caper_jax.training.optimizer import Optimizer
-from caper_jax.training.state import TrainState, make_step
+from caper_jax.training.step import TrainState, make_step
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 BATCH = 16

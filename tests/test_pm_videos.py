@@ -8,9 +8,9 @@ import pytest
 import roots
 from frames import TRUTH_FIELDS
 
-from caper_jax.data import open_dataset
-from caper_jax.data.pm_videos import PmVideosDataset, group_videos
-from caper_jax.data.schema import validate
+from caper_jax.data.readers import open_dataset
+from caper_jax.data.readers.pm_videos import PmVideosDataset, group_videos
+from caper_jax.data.types import validate
 from caper_jax.errors import CaperError
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import roots
 
-from caper_jax.data import open_dataset
-from caper_jax.data.reart_videos import ReArtVideosDataset
-from caper_jax.data.reartmix import ReArtMixDataset
-from caper_jax.data.schema import validate
+from caper_jax.data.readers import open_dataset
+from caper_jax.data.readers.reart_videos import ReArtVideosDataset
+from caper_jax.data.readers.reartmix import ReArtMixDataset
+from caper_jax.data.types import validate
 from caper_jax.errors import CaperError
 
 SOURCE = "scene6/000001"

@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from caper_jax.data import open_dataset
-from caper_jax.data.reartmix import ReArtMixDataset
-from caper_jax.data.reartmix_models import conversion_of
-from caper_jax.data.schema import pose_problems, validate
+from caper_jax.data.readers import open_dataset
+from caper_jax.data.readers.reartmix import ReArtMixDataset
+from caper_jax.data.readers.reartmix_models import conversion_of
+from caper_jax.data.types import pose_problems, validate
 from caper_jax.errors import CaperError
 
 
@@ -197,7 +197,7 @@ def metas(root):
 
 
 def stored_boxes(meta):
-    """[1+K, 2, 3] low and high of the whole and of the links, metres."""
+    """[1+K, 2, 3] low and high of the whole and of the links, meters."""
     corners = np.array(meta["corner_pts"]).reshape(-1, 2, 3)
     return np.sort(corners, axis=1)
 
@@ -247,7 +247,7 @@ def way(truth, vector, part=0):
     return truth.rotation[part] @ np.asarray(vector, float)
 
 
-def check_frames(truth, category, meta):
+def check_frame_count(truth, category, meta):
     """What no rest pose changes: joints, the root's box, the motion between the parts."""
     pose, scale = root_pose(meta["id"])
     turn = pose[:3, :3] / scale
@@ -287,7 +287,7 @@ def test_cutters(root, tmp_path, metas, model):
     axis /= np.linalg.norm(axis)
     out = (body[0, 1] - blade[0, 1]) / axis[1]
     truth = read(root, tmp_path, metas, "cutter", model, 0.03)
-    check_frames(truth, "cutter", meta)
+    check_frame_count(truth, "cutter", meta)
     assert 0.07 < out < 0.1
     assert truth.joint_state[0] == pytest.approx(scale * (out - 0.03), abs=1e-6)
     turn = pose[:3, :3] / scale
@@ -307,7 +307,7 @@ def test_staplers(root, tmp_path, metas, model):
     arm = stored_boxes(meta)[2]
     pose, scale = root_pose(model)
     truth = read(root, tmp_path, metas, "stapler", model, -np.radians(120))
-    check_frames(truth, "stapler", meta)
+    check_frame_count(truth, "stapler", meta)
     turn = pose[:3, :3] / scale
     np.testing.assert_allclose(way(truth, (0, 0, 1)), turn[:, 1], atol=1e-6)
     np.testing.assert_allclose(way(truth, (0, 1, 0)), turn[:, 2], atol=1e-6)
@@ -331,7 +331,7 @@ def test_scissors(root, tmp_path, metas, model):
     meta = metas[model]
     assert meta["joint_rpy"][0][0] < -0.99  # so this is +z for the blades
     truth = read(root, tmp_path, metas, "scissors", model, -np.radians(40))
-    check_frames(truth, "scissors", meta)
+    check_frame_count(truth, "scissors", meta)
     assert truth.joint_state[0] == pytest.approx(np.radians(30), abs=1e-5)
     pose, scale = root_pose(model)
     turn = pose[:3, :3] / scale
@@ -342,7 +342,7 @@ def test_scissors(root, tmp_path, metas, model):
     # A tilted axis takes the second blade a little out of the plane.
     assert way(truth, (cos, 0, -sin), part=1) @ second[:, 0] > 0.99
     assert truth.joint_axis[0, 1] > 0.99
-    # Handles reach at least as far as blades, but for one model by two millimetres.
+    # Handles reach at least as far as blades, but for one model by two millimeters.
     _, one, two = stored_boxes(meta)
     assert -one[0, 1] > one[1, 1] - 0.0015 and -two[0, 0] > two[1, 0] - 0.0025
 

@@ -14,24 +14,24 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.kinematics import forward_kinematics
+from caper_jax.config import RegistrationConfig
 from caper_jax.errors import CaperError
-from caper_jax.geometry import se3
-from caper_jax.networks.graph import smallest
+from caper_jax.lie import se3
+from caper_jax.models.encoders.neighbors import smallest
 from caper_jax.tracking import registration
 from caper_jax.tracking.registration import (
+    JointTree,
     PartPoses,
-    RegistrationConfig,
-    Tree,
     empty_surface,
     extend_surface,
-    hold_still,
-    mismatch,
+    match_cost,
     move_surface,
     register,
+    suppress_jitter,
 )
 
 CONFIG = RegistrationConfig()
-# Types, parents, axes, pivots, and the boxes of the parts (size, centre) at rest; units.
+# Types, parents, axes, pivots, and the boxes of the parts (size, center) at rest; units.
 TREES = {
     "hinge": (
         ("revolute",),
@@ -65,9 +65,9 @@ TWIST = np.array([0.04, -0.03, 0.05, 0.03, 0.05, -0.04])
 MOVE = {"revolute": 0.08, "prismatic": 0.06}
 
 
-def tree_of(name: str) -> Tree:
+def tree_of(name: str) -> JointTree:
     types, parents, axis, pivot, _ = TREES[name]
-    return Tree(np.array(axis, np.float32), np.array(pivot, np.float32), types, parents)
+    return JointTree(np.array(axis, np.float32), np.array(pivot, np.float32), types, parents)
 
 
 def rigid(turn, shift):
@@ -84,7 +84,7 @@ def twist(xi):
     return expm(matrix)
 
 
-def kinematics(tree: Tree, state):
+def kinematics(tree: JointTree, state):
     """[K, 4, 4] part poses in the root's frame, by SciPy."""
     poses = [np.eye(4)]
     for kind, parent, axis, pivot, value in zip(
@@ -306,17 +306,17 @@ class TestRegister:
             cloud = np.asarray(cloud[:100], float)
 
             @quick_jit
-            def linearised(step):
+            def linearized(step):
                 pose = se3.compose(root, se3.exp(step[:6])), state + step[6:]
                 about = surface, parts, cloud, labels[:100], *pose, CONFIG
                 matches = registration._residuals(*about)[-1]
-                return *registration._linearise(*about)[:2], matches
+                return *registration._linearize(*about)[:2], matches
 
-            _, jacobian, matches = linearised(np.zeros(9))
+            _, jacobian, matches = linearized(np.zeros(9))
             assert jacobian.shape == (100, 3, 9)
             assert len(set(np.asarray(surface.labels)[matches])) == 4
             for column, step in enumerate(1e-6 * np.eye(9)):
-                ahead, behind = linearised(step), linearised(-step)
+                ahead, behind = linearized(step), linearized(-step)
                 np.testing.assert_array_equal(ahead[-1], matches)
                 slope = (ahead[0] - behind[0]) / 2e-6
                 np.testing.assert_allclose(jacobian[:, :, column], slope, atol=1e-7)
@@ -324,7 +324,7 @@ class TestRegister:
 
 def test_mismatch_is_nothing_at_the_truth_and_one_far_away():
     surface, parts, cloud, labels, start, truth = seen("hinge")
-    found = quick_jit(partial(mismatch, config=CONFIG))
+    found = quick_jit(partial(match_cost, config=CONFIG))
     assert found(surface, parts, cloud, labels, truth) < 0.01
     assert 0.1 < found(surface, parts, cloud, labels, start) < 0.9
     assert found(surface, parts, cloud + np.float32([0, 0, 2]), labels, truth) > 0.99
@@ -362,7 +362,7 @@ class TestHoldStill:
         shares = [self.share([0, 0, 0, size, 0, 0]) for size in sizes]
         np.testing.assert_allclose(shares, 1 - (0.03 / np.array(sizes)) ** 2, atol=1e-3)
 
-    def test_joint_states_are_marginalised_out(self):
+    def test_joint_states_are_marginalized_out(self):
         """A motion that a joint explains as well is within the uncertainty."""
         information = 1e4 * np.eye(7)
         information[3, 6] = information[6, 3] = 0.99 * 1e4
@@ -370,7 +370,7 @@ class TestHoldStill:
         assert self.share([0, 0, 0, 0, 0.1, 0], information) == pytest.approx(0.91, abs=1e-3)
 
 
-hold = quick_jit(hold_still)
+hold = quick_jit(suppress_jitter)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -22,15 +22,15 @@ from tiny import network, random_variables
 from tracks import BOX, KnownTracker, disturbed, track, write_videos
 
 from caper_jax import categories, cli
-from caper_jax.articulation.equivalence import second_reading
+from caper_jax.articulation.symmetry import apply_symmetry
 from caper_jax.cli.reproduce import OPTIONS, REPRODUCTIONS
-from caper_jax.configuration import to_dict
+from caper_jax.config import GeneratorConfig, RegistrationConfig, TrackerConfig, to_dict
 from caper_jax.data import hdf5
-from caper_jax.data.synthetic.config import GeneratorConfig
 from caper_jax.errors import CaperError
 from caper_jax.evaluation import protocol
 from caper_jax.evaluation.metrics import object_diagonal
-from caper_jax.evaluation.tables import (
+from caper_jax.models.files import write_model
+from caper_jax.reproduce import (
     comparison,
     increments,
     jitter,
@@ -42,14 +42,11 @@ from caper_jax.evaluation.tables import (
     trainings,
     videos,
 )
-from caper_jax.evaluation.tables import frames as frames_of_tables
-from caper_jax.evaluation.tables.options import Options
-from caper_jax.evaluation.tables.paper import OCCLUSION, TABLES
-from caper_jax.evaluation.tables.render import Curves, Table, markdown
-from caper_jax.model_files import write_model
+from caper_jax.reproduce import frames as frames_of_tables
+from caper_jax.reproduce.options import Options
+from caper_jax.reproduce.paper import OCCLUSION, TABLES
+from caper_jax.reproduce.render import Curves, Table, markdown
 from caper_jax.tracker import Tracker
-from caper_jax.tracking.config import TrackerConfig
-from caper_jax.tracking.registration import RegistrationConfig
 from caper_jax.visualization.curves import write_curves
 
 LAPTOP = categories.get("laptop")
@@ -168,10 +165,10 @@ def test_the_declared_symmetry_has_rows_of_its_own(tmp_path):
     for name in dataset.videos():
         truths = [frame.truth for frame in source.frames(name)]
         truth = jax.tree.map(lambda *rows: np.stack(rows), *truths)
-        (equivalence,) = LAPTOP.equivalences
-        truth.size[:, 1] = truth.size[:, 0] @ np.abs(np.array(equivalence.turn))
-        tracks.append(track(name, truth, second_reading(truth, equivalence, LAPTOP)))
-    found = runs.summarise(tracks, source, runs.Condition())
+        (symmetry,) = LAPTOP.symmetries
+        truth.size[:, 1] = truth.size[:, 0] @ np.abs(np.array(symmetry.turn))
+        tracks.append(track(name, truth, apply_symmetry(truth, symmetry, LAPTOP)))
+    found = runs.summarize(tracks, source, runs.Condition())
     assert found["frames"] == 6 and found["mean_diagonal_m"] > 0
     rows = comparison.rows("laptop", "given", found, TABLES["table6"].categories["laptop"])
     assert [row[2] for row in rows] == 2 * ["given"] + 2 * ["given, up to symmetry"]
@@ -225,9 +222,9 @@ class TestStatic:
         assert run("table2", tmp_path / "out", *known) == 0
         output = capsys.readouterr().out
         means, spreads = output.split("**All errors")
-        row = cells(means, "box", "lid", "as labelled")
+        row = cells(means, "box", "lid", "as labeled")
         assert row[:9] == ["1.50", "0.00", "0.00", "0.012", "4.30", "0.00", "0.00", "90.1", "100.0"]
-        assert cells(spreads, "box", "lid", "as labelled", "0.00 / 0.00")[:3] == [
+        assert cells(spreads, "box", "lid", "as labeled", "0.00 / 0.00")[:3] == [
             *("0.0", "0.0 / 0.0", "100.0 / 100.0")
         ]
         assert "5 frames of" in output and "0 failures" in output
@@ -247,7 +244,7 @@ class TestStatic:
         assert run("table2", tmp_path, *known) == 0
         output = capsys.readouterr().out
         assert "5 failures" in output
-        assert cells(output, "box", "lid", "as labelled", "180.00 / 180.00")[0] == "100.0"
+        assert cells(output, "box", "lid", "as labeled", "180.00 / 180.00")[0] == "100.0"
         found = json.loads((tmp_path / "table2.json").read_text())["categories"]["box"]["parts"]
         truth = random_frames(5, 1500)["pose"]
         share = np.linalg.norm(truth.translation, axis=-1) / object_diagonal(truth)[:, None]
@@ -444,7 +441,7 @@ def test_trembling_is_the_change_from_frame_to_frame():
 
 
 def summary(turn, shift, iou=0.5):
-    """Of one part, as ``summarise_tracks`` has it."""
+    """Of one part, as ``summarize_tracks`` has it."""
     values = {"rotation_deg": turn, "translation_relative": shift, "iou_full": iou}
     return {"parts": [{"name": "base", **{key: {"mean": v} for key, v in values.items()}}]}
 
@@ -560,7 +557,7 @@ def test_every_reproduction_can_be_asked_for():
     assert set(OPTIONS) <= fields
     for reproduction in REPRODUCTIONS.values():
         assert set(reproduction.options) <= set(OPTIONS)
-        module = importlib.import_module(f"caper_jax.evaluation.tables.{reproduction.module}")
+        module = importlib.import_module(f"caper_jax.reproduce.{reproduction.module}")
         assert callable(module.run)
 
 
@@ -583,7 +580,7 @@ def test_curves_are_drawn(tmp_path):
     write_curves(tmp_path / "a.png", Curves("growth", "frame", "error [deg]", lines))
     with Image.open(tmp_path / "a.png") as image:
         colors = np.asarray(image.convert("RGB")).reshape(-1, 3)
-    for wanted in ((31, 119, 180), (255, 127, 14)):  # matplotlib's first two colours
+    for wanted in ((31, 119, 180), (255, 127, 14)):  # matplotlib's first two colors
         assert (colors == wanted).all(1).sum() > 100
 
 

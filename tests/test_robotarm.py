@@ -10,11 +10,11 @@ from solid_points import deepest_overlap, loose
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.categories import robotarm_chains as chains
 from caper_jax.categories.robotarm import _FAMILIES, ROBOTARM
-from caper_jax.data.synthetic.bank import draw_models
 from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.synthetic.instances import draw_instances
 
 HALF = np.pi / 2
-# Published Denavit-Hartenberg tables: (theta at zero, d, a, alpha), metres. Then the sign of each
+# Published Denavit-Hartenberg tables: (theta at zero, d, a, alpha), meters. Then the sign of each
 # joint's published angle in the category's convention, and the columns of the category's frame
 # (x, y, z) in the published base frame.
 STANDARD = {
@@ -108,7 +108,7 @@ def skeleton(chain):
 
 @pytest.fixture(scope="module")
 def arms():
-    return draw_models(ROBOTARM, 200, "train", 5)
+    return draw_instances(ROBOTARM, 200, "train", 5)
 
 
 @pytest.mark.parametrize("name", STANDARD)
@@ -126,7 +126,7 @@ def test_flanges_go_where_published_kinematics_puts_them(name):
         ours = to_base @ (last[:3, :3] @ flange + last[:3, 3])
         np.testing.assert_allclose(to_base @ last[:3, :3] @ chain.tip, published[:3, 2], atol=1e-12)
         offsets.append(ours - published[:3, 3])
-    # The rows of the families are rounded to millimetres, the side of the M1013's forearm to 5 mm.
+    # The rows of the families are rounded to millimeters, the side of the M1013's forearm to 5 mm.
     assert np.linalg.norm(offsets, axis=1).max() < (0.006 if name == "M1013" else 0.002)
 
 

@@ -7,10 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from caper_jax.geometry.scan import as_before, grid_scan_order, in_order, scan_order
+from caper_jax.geometry.raster_order import (
+    from_raster_order,
+    grid_raster_order,
+    raster_order,
+    to_raster_order,
+)
 
 on_host_and_device = pytest.mark.parametrize(
-    "order_of", [scan_order, lambda points: np.asarray(jax.jit(scan_order)(jnp.asarray(points)))]
+    "order_of",
+    [raster_order, lambda points: np.asarray(jax.jit(raster_order)(jnp.asarray(points)))],
 )
 
 
@@ -41,7 +47,7 @@ def test_rows_of_an_image_are_run_through_to_and_fro(order_of, lines):
     for number, columns in enumerate(column.reshape(32, -1)):
         steps = np.diff(columns) * (-1 if number % 2 else 1)
         assert (steps >= 0).all() and (steps <= 1).all()
-    np.testing.assert_array_equal(order, grid_scan_order(lines))
+    np.testing.assert_array_equal(order, grid_raster_order(lines))
 
 
 @on_host_and_device
@@ -95,16 +101,16 @@ def test_it_is_a_permutation_whatever_the_cloud(order_of):
 
 def test_rows_go_back_where_they_were():
     points = jnp.stack([spread(50, 1), spread(50, 2)])
-    order = scan_order(points)
-    there = in_order(points, order)
+    order = raster_order(points)
+    there = to_raster_order(points, order)
     for own, cloud, sorted_cloud in zip(order, points, there, strict=True):
         np.testing.assert_array_equal(np.asarray(cloud)[np.asarray(own)], sorted_cloud)
-    np.testing.assert_array_equal(as_before(there, order), points)
+    np.testing.assert_array_equal(from_raster_order(there, order), points)
 
     def weighted(points):
-        order = scan_order(points)
-        rows = in_order(points, order) * jnp.arange(50.0)[:, None]
-        return (as_before(rows, order) ** 2).sum()
+        order = raster_order(points)
+        rows = to_raster_order(points, order) * jnp.arange(50.0)[:, None]
+        return (from_raster_order(rows, order) ** 2).sum()
 
     place = np.argsort(np.asarray(order), axis=1)[..., None]
     expected = 2.0 * np.asarray(points) * place**2

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from solid_points import deepest_overlap, inside, loose
 
 from caper_jax import categories
-from caper_jax.articulation.equivalence import second_reading
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.synthetic.bank import build_bank, draw_models
+from caper_jax.articulation.symmetry import apply_symmetry
 from caper_jax.geometry.solid_bounds import bounds
 from caper_jax.geometry.solids import Solid
+from caper_jax.synthetic.instances import build_bank, draw_instances
 
 REST = 20.0  # degrees between the blades
 HALF_TURN = np.diag([1.0, -1.0, -1.0])
@@ -22,7 +22,7 @@ HALF_TURN = np.diag([1.0, -1.0, -1.0])
 
 @pytest.fixture(scope="module")
 def scissors():
-    return draw_models(categories.get("scissors"), 200, "train", 3)
+    return draw_instances(categories.get("scissors"), 200, "train", 3)
 
 
 def turned(solids: list[Solid], rotation: np.ndarray, pivot: np.ndarray) -> list[Solid]:
@@ -48,7 +48,7 @@ def straight_size(model, part):
 
 
 def reach(model, part):
-    """How far the handle reaches back from the pivot, metres."""
+    """How far the handle reaches back from the pivot, meters."""
     return -bounds(straightened(model, part))[0][0]
 
 
@@ -158,7 +158,7 @@ def test_equal_halves_change_places_by_the_declared_half_turn(scissors):
         joint_pivot=bank.joint_pivot,
         joint_state=state,
     )
-    second = second_reading(truth, category.equivalences[0], category)
+    second = apply_symmetry(truth, category.symmetries[0], category)
     np.testing.assert_allclose(second.size, truth.size, atol=1e-6)
     np.testing.assert_allclose(second.box_center, truth.box_center, atol=1e-6)
     np.testing.assert_allclose(second.joint_axis, truth.joint_axis, atol=1e-12)
@@ -196,7 +196,7 @@ def test_every_measured_pair_has_one_like_it(shared_data):
                 measured.append([size[length], size[width], size[2], high[length]])
     assert len(measured) == 18
     drawn = []
-    for model in draw_models(categories.get("scissors"), 800, "train", 0):
+    for model in draw_instances(categories.get("scissors"), 800, "train", 0):
         low, high = bounds(straightened(model, 0))
         drawn.append([high[0] - low[0], high[2] - low[2], high[1] - low[1], high[0]])
     ratio = np.abs(np.log(np.array(drawn)[:, None] / np.array(measured)))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from caper_jax.networks.selection import first_smallest, smallest_k
+from caper_jax.models.encoders.selection import first_smallest, smallest_k
 
 
 def random(*shape, seed=0):

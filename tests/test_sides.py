@@ -12,15 +12,15 @@ import pytest
 
 from caper_jax import categories
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.confidence import EVIDENCE
-from caper_jax.data.synthetic.config import GeneratorConfig
-from caper_jax.data.synthetic.scene import Generator
+from caper_jax.config import GeneratorConfig, RefinerConfig
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load, shipped_weights
-from caper_jax.geometry import se3, so3
-from caper_jax.model_files import read_model
-from caper_jax.networks import sides
-from caper_jax.reading import articulated_pose
+from caper_jax.lie import se3, so3
+from caper_jax.models import refiner
+from caper_jax.models.files import read_model
+from caper_jax.models.pipeline import articulated_pose
+from caper_jax.models.uncertainty import EVIDENCE
+from caper_jax.synthetic.frames import Generator
 from caper_jax.training import sides as fitting
 
 BOX = categories.get("box")
@@ -31,7 +31,7 @@ def reading(category, rng, batch=2):
     parts, joints = category.num_parts, category.num_joints
     axis = rng.normal(size=(batch, joints, 3))
     root = se3.from_rt(so3.exp(rng.normal(size=(batch, 3))), rng.normal(size=(batch, 3)))
-    return sides.Reading(
+    return refiner.StageEstimate(
         root=jnp.asarray(root, jnp.float32),
         axis=jnp.asarray(axis / np.linalg.norm(axis, axis=-1, keepdims=True), jnp.float32),
         pivot=jnp.asarray(rng.normal(size=(batch, joints, 3)), jnp.float32),
@@ -49,11 +49,13 @@ def test_features_count_points_in_the_box_of_their_part(category):
     cloud = rng.normal(size=(2, 50, 3)).astype(np.float32)
     share = rng.dirichlet(np.ones(category.num_parts), (2, 50)).astype(np.float32)
     evidence = np.zeros((2, EVIDENCE), np.float32)
-    found = sides.side_features(one, jnp.asarray(cloud), jnp.asarray(share), evidence, category)
-    assert found.shape == (2, sides.num_features(category.num_parts))
+    found = refiner.refiner_features(
+        one, jnp.asarray(cloud), jnp.asarray(share), evidence, category
+    )
+    assert found.shape == (2, refiner.num_features(category.num_parts))
     view = np.broadcast_to(np.eye(3, dtype=np.float32), (2, 3, 3))
     pose = articulated_pose(one, view, category)
-    places = sides._PLACES
+    places = refiner._PLACES
     spread = np.asarray(found)[:, : category.num_parts * 3 * len(places)]
     spread = spread.reshape(2, category.num_parts, 3, len(places))
     for b in range(2):
@@ -61,7 +63,7 @@ def test_features_count_points_in_the_box_of_their_part(category):
             away = cloud[b] - np.asarray(pose.translation[b, k]) * category.unit
             own = away @ np.asarray(pose.rotation[b, k])
             inside = (own - np.asarray(one.center[b, k])) / (np.asarray(one.size[b, k]) / 2)
-            passed = np.clip((places - inside[..., None]) / sides._RAMP + 0.5, 0, 1)
+            passed = np.clip((places - inside[..., None]) / refiner._RAMP + 0.5, 0, 1)
             weight = share[b, :, k] / (share[b, :, k].sum() + 1)
             wanted = (weight[:, None, None] * passed).sum(0)
             np.testing.assert_allclose(spread[b, k], wanted, atol=2e-4)
@@ -73,7 +75,7 @@ def test_a_tilted_side_shows_its_slope():
     across = rng.uniform(-1, 1, (400, 2))
     x = 1.01 + 0.05 * across[:, 0] - 0.03 * across[:, 1]
     inside = np.column_stack([x, across]).astype(np.float32)[None, :, None]
-    tilt = np.asarray(sides._tilt(jnp.asarray(inside), jnp.ones((1, 400, 1)), 1.0))[0, 0, 0]
+    tilt = np.asarray(refiner._tilt(jnp.asarray(inside), jnp.ones((1, 400, 1)), 1.0))[0, 0, 0]
     assert tilt[1] == pytest.approx(0.01, abs=5e-3)
     assert tilt[2] / 3 == pytest.approx(0.05, abs=0.012)
     assert tilt[3] / 3 == pytest.approx(-0.03, abs=0.012)
@@ -89,20 +91,20 @@ def test_the_difference_to_the_truth_takes_an_estimate_there(category):
     view = so3.exp(rng.normal(size=(2, 3)).astype(np.float32))
     poses = [articulated_pose(one, view, category) for one in (near, truth)]
     output = fitting.difference(*poses, category)
-    mended: ArticulatedPose = articulated_pose(sides.corrected(near, output), view, category)
+    mended: ArticulatedPose = articulated_pose(refiner.apply_residual(near, output), view, category)
     for name in ("rotation", "translation", "size", "box_center", "joint_state"):
         found, wanted = getattr(mended, name), getattr(poses[1], name)
         np.testing.assert_allclose(found, wanted, atol=2e-5, err_msg=name)
 
 
 def test_it_says_nothing_before_it_is_fitted():
-    module = sides.SidesNetwork(8, 2)
-    features = np.random.default_rng(3).normal(size=(2, sides.num_features(2)))
+    module = refiner.BoxRefiner(8, 2)
+    features = np.random.default_rng(3).normal(size=(2, refiner.num_features(2)))
     output = module.apply(module.init(jax.random.key(0), features), features)
     assert all(not np.any(leaf) for leaf in jax.tree.leaves(output))
     one = reading(BOX, np.random.default_rng(4))
     for found, wanted in zip(
-        *map(jax.tree.leaves, (sides.corrected(one, output), one)), strict=True
+        *map(jax.tree.leaves, (refiner.apply_residual(one, output), one)), strict=True
     ):
         np.testing.assert_allclose(found, wanted, atol=1e-6)
 
@@ -122,7 +124,7 @@ def errors(estimator, batch):
 
 
 def without(estimator):
-    network = dataclasses.replace(estimator.network, sides_width=0)
+    network = dataclasses.replace(estimator.network, refiner=RefinerConfig())
     return Estimator(estimator.category, network, estimator.variables, estimator.card)
 
 
@@ -140,7 +142,7 @@ def test_fitting_writes_a_model_that_knows_sizes_better(tmp_path, monkeypatch):
     fitting.add_sides(folder, "box", data, 64, 4096)
     card, variables = read_model(folder)
     assert card["run"]["network"]["sides_width"] == 64 and "calibration" not in card
-    assert variables["params"]["sides"]["Dense_0"]["kernel"].shape[1] == 64
+    assert variables["params"]["refiner"]["Dense_0"]["kernel"].shape[1] == 64
     fitted, batch = load("box", folder), frames(BOX)
     assert errors(fitted, batch)[1] < 0.95 * errors(without(fitted), batch)[1]
 

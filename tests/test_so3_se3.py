@@ -13,8 +13,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from caper_jax.errors import CaperError
-from caper_jax.geometry import se3, so3
-from caper_jax.geometry.linalg import norm
+from caper_jax.lie import se3, so3
+from caper_jax.lie.linalg import norm
 
 ANGLES = (
     0.0,

@@ -18,7 +18,7 @@ KINDS = ("box", "cylinder", "ellipsoid", "frustum", "cone")
 
 
 def draw(rng: np.random.Generator, kind: str, scale: float, hole: Solid | None = None) -> Solid:
-    """A solid of about ``scale`` metres near the origin, turned anyhow."""
+    """A solid of about ``scale`` meters near the origin, turned anyhow."""
     rotation = Rotation.random(rng=rng).as_matrix()
     center, half = scale * rng.uniform(-0.7, 0.7, 3), scale * rng.uniform(0.3, 1.0, 3)
     taper = tuple(rng.uniform(0.3, 1.0, 2)) if kind == "frustum" else (1.0, 1.0)
@@ -43,7 +43,7 @@ def test_what_a_hole_leaves(kind, hole):
             assert not solid_points.inside(solid, points, -1e-9).any()
             continue
         mesh = part_mesh([solid], sections=96)
-        # Circles have 128 sections here and 96 in the mesh: a sliver of a millimetre.
+        # Circles have 128 sections here and 96 in the mesh: a sliver of a millimeter.
         tolerance = 1e-9 if {kind, hole} <= {"box", "frustum"} else 1e-3
         np.testing.assert_allclose([low, high], mesh.bounds, rtol=0, atol=tolerance)
         cut += not np.allclose([low, high], solid.extent(), rtol=0, atol=5e-3)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from caper_jax.cli import generate
-from caper_jax.data.synthetic import render, scene, videos, views
+from caper_jax.synthetic import frames, render, videos, views
 
 VIDEOS = ("--videos", "1", "--frames-per-video", "2")
 
@@ -23,7 +23,7 @@ def stop(*arguments, **_):
 @pytest.mark.parametrize(
     ("options", "owner", "name"),
     [
-        ((), scene.Generator, "batch"),
+        ((), frames.Generator, "batch"),
         (VIDEOS, videos.VideoGenerator, "batch"),
         (("--images",), render, "render_image"),
         (("--layout", "artimage"), views, "still"),
@@ -40,7 +40,7 @@ def test_every_split_has_its_own_keys(options, owner, name, tmp_path, monkeypatc
             asked += ["--frames", "2"]
         with pytest.raises(Drawn) as drawn:
             generate.main([*asked, *options])
-        method = owner in (scene.Generator, videos.VideoGenerator)
+        method = owner in (frames.Generator, videos.VideoGenerator)
         keys[split] = jax.random.key_data(drawn.value.args[0][1 if method else 0])
     # That of the published test sets.
     first = jax.random.fold_in(jax.random.key(7), 0)

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from caper_jax.networks.layers import after, weights_first
-from caper_jax.training.staging import gradient_at_once
+from caper_jax.models.layers import after, weights_first
+from caper_jax.training.eager_gradient import value_with_eager_gradient
 
 
 def layers(params, inputs):
@@ -24,7 +24,7 @@ def plain(params, inputs):
 
 
 def staged(params, inputs):
-    one, mean, done = gradient_at_once(layers)(params["one"], inputs)
+    one, mean, done = value_with_eager_gradient(layers)(params["one"], inputs)
     return one + layers(params["two"], after(done, inputs + jax.lax.stop_gradient(mean)))[0]
 
 
@@ -57,7 +57,7 @@ def test_value_and_gradient_are_those_of_the_plain_sum():
 
 def test_the_gradient_follows_a_factor_in_front_of_the_loss():
     params, inputs = case()
-    loss = gradient_at_once(layers)
+    loss = value_with_eager_gradient(layers)
     slopes = jax.grad(lambda p: 3.0 * loss(p, inputs)[0])(params["one"])
     expected = jax.grad(lambda p: layers(p, inputs)[0])(params["one"])
     for slope, other in zip(slopes, expected, strict=True):

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from solid_points import inside, loose
 
 from caper_jax import categories
-from caper_jax.data.synthetic.bank import draw_models
 from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.synthetic.instances import draw_instances
 
 # Base length and width, height of the base with the hinge's cheeks, and height of the hinge over
 # the underside of the seven measured ReArt-48 staplers, mm.
@@ -26,7 +26,7 @@ MEASURED = [
 
 @pytest.fixture(scope="module")
 def staplers():
-    return draw_models(categories.get("stapler"), 200, "train", 3)
+    return draw_instances(categories.get("stapler"), 200, "train", 3)
 
 
 def boxes(model):
@@ -82,7 +82,7 @@ def test_sizes_are_those_of_real_staplers(staplers):
 
 
 def test_every_measured_stapler_has_one_like_it():
-    models = draw_models(categories.get("stapler"), 800, "train", 0)
+    models = draw_instances(categories.get("stapler"), 800, "train", 0)
     drawn = []
     for model in models:
         low, high = boxes(model)[0]

@@ -13,15 +13,15 @@ from tiny import network, random_variables
 
 from caper_jax import categories
 from caper_jax.articulation.category import Category, Joint
-from caper_jax.articulation.equivalence import second_reading
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.synthetic.scene import Batch
-from caper_jax.geometry import se3
-from caper_jax.geometry.scan import scan_order
-from caper_jax.networks.canonical import view_rotation
-from caper_jax.networks.caper import PartsOutput, RootOutput
-from caper_jax.training.losses import LossWeights
-from caper_jax.training.task import LossConfig, Task
+from caper_jax.articulation.symmetry import apply_symmetry
+from caper_jax.config import LossConfig, LossWeights
+from caper_jax.geometry.frames import view_rotation
+from caper_jax.geometry.raster_order import raster_order
+from caper_jax.lie import se3
+from caper_jax.models.networks import PartsOutput, RootOutput
+from caper_jax.synthetic.frames import Batch
+from caper_jax.training.objective import Objective
 
 BOX = categories.get("box")
 THIN = ((0.22, 0.020, 0.09), (0.22, 0.018, 0.09))  # two like trays: which is the base?
@@ -83,7 +83,7 @@ def frames(category, sizes, seed=0, count=64):
     labels[:, 5] = -1  # residue
     pose = (rotation, translation, sizes, center, axis, pivot, state)
     # As the networks will see them: an oracle that stands for them answers point by point.
-    order = scan_order(points)
+    order = raster_order(points)
     return Batch(
         points=jnp.asarray(points[rows, order], jnp.float32),
         labels=jnp.asarray(labels[rows, order], jnp.int32),
@@ -93,12 +93,12 @@ def frames(category, sizes, seed=0, count=64):
     )
 
 
-class Oracle(Task):
+class Oracle(Objective):
     """A task whose networks answer what they are told to, in place of weights.
 
     ``params`` of either stage is (pose [B, ...], labels [B, N], view [B, 3, 3], error [3, 3] of the
     root in the viewing frame); the points that each stage is given come back as its state. Stage
-    II's increment is that from the reference its points were canonicalised with (Eq 10).
+    II's increment is that from the reference its points were canonicalized with (Eq 10).
     """
 
     def _noisy_root(self, key, output, truth):
@@ -154,7 +154,7 @@ class Oracle(Task):
         """(total loss, points that stage II is given, metrics) when the networks answer so."""
         if not hasattr(self, "_jitted"):
             self._jitted = jax.jit(lambda params, batch: self.loss(params, *self._rest(batch)))
-        view = view_rotation(batch.points, self.category.viewpoint.mean_roll)
+        view = view_rotation(batch.points, self.category.viewpoint.camera_roll)
         params = (pose, jnp.asarray(labels), view, jnp.asarray(error.as_matrix(), jnp.float32))
         total, (state, metrics) = self._jitted({"root": params, "parts": params}, batch)
         return total, np.asarray(state["seen"]["parts"]), metrics
@@ -231,7 +231,7 @@ def test_the_total_weighs_each_loss_as_the_paper_does():
     assert min(named.values()) > 1e-3
     expected = sum(weights[name] * value for name, value in named.items())
     np.testing.assert_allclose(total, expected, rtol=1e-5)
-    # In network units, 4 per metre; angles are not lengths.
+    # In network units, 4 per meter; angles are not lengths.
     size = 4 * np.abs(0.1 * sizes).mean()
     center = 4 * np.abs(np.asarray(batch.pose.box_center - pose.box_center)).mean()
     np.testing.assert_allclose(metrics["scale"], size + center, rtol=1e-4)
@@ -243,8 +243,8 @@ def test_the_total_weighs_each_loss_as_the_paper_does():
 
 def test_ambiguous_objects_are_scored_under_the_reading_they_are_predicted_in():
     batch = frames(BOX, [THIN, DEEP, THIN])
-    (equivalence,) = BOX.equivalences
-    second = second_reading(batch.pose, equivalence, BOX)
+    (symmetry,) = BOX.symmetries
+    second = apply_symmetry(batch.pose, symmetry, BOX)
     labels = np.asarray(batch.labels)
     exchanged = np.where(labels < 0, -1, 1 - labels)
     # Labels follow the reading, sample by sample.
@@ -269,7 +269,7 @@ def per_sample_rotation(batch, predicted):
 
 
 def aligned(points, reference):
-    """Rotation vectors [B, 3] and shifts that take reference to points, and the misfit."""
+    """Rotation vectors [B, 3] and shifts that take reference to points, and the box_residual."""
     means = points.mean(1, keepdims=True), reference.mean(1, keepdims=True)
     cross = np.einsum("bni,bnj->bij", points - means[0], reference - means[1])
     u, _, v = np.linalg.svd(cross)
@@ -292,8 +292,8 @@ def test_stage_two_sees_noisy_roots_and_predicted_ones_that_are_nearly_right():
         """Errors of the roots, in degrees and network units, when stage I is ``degrees`` off."""
         error = Rotation.from_rotvec([0, 0, np.radians(degrees)])
         points = task.play(batch, batch.pose, batch.labels, error)[1]
-        turn, shift, misfit = aligned(points, truth)
-        assert misfit < 1e-4  # whatever the root, a rigid motion
+        turn, shift, box_residual = aligned(points, truth)
+        assert box_residual < 1e-4  # whatever the root, a rigid motion
         return np.degrees(turn), shift
 
     # Too far off: none of the predictions is used.
@@ -317,7 +317,7 @@ def test_the_noise_of_the_roots_is_small_and_large():
     pose = jax.tree.map(lambda leaf: jnp.repeat(leaf[:1], count, 0), frames(BOX, [DEEP]).pose)
     directions = jnp.broadcast_to(jnp.eye(3)[:2], (count, 2, 3))
     output = RootOutput(directions, jnp.ones((count, 2)), jnp.zeros((count, 3)))
-    reference, _ = Task(BOX, network(), config)._noisy_root(jax.random.key(0), output, pose)
+    reference, _ = Objective(BOX, network(), config)._noisy_root(jax.random.key(0), output, pose)
     shift = np.asarray(reference[:, :3, 3] - pose.translation[:, 0])
     # The mean square of a factor exp(U(-log 4, log 4)).
     square = (spread**2 - spread**-2) / (4 * np.log(spread))
@@ -332,7 +332,9 @@ def trained(request):
     batch = frames(BOX, [THIN, DEEP, THIN, DEEP])
     batch = batch.replace(points=batch.points.at[3].set(jnp.asarray([0.1, 0.0, 0.8])))
     # Heads of either kind, each with one encoder.
-    task = Task(BOX, network(request.param, request.param == "hs", point_stride=2), LossConfig())
+    task = Objective(
+        BOX, network(request.param, request.param == "hs", point_stride=2), LossConfig()
+    )
     variables = random_variables(BOX, task.network)
     params, state = variables["params"], {"batch_stats": variables["batch_stats"]}
 
@@ -375,7 +377,7 @@ def test_training_on_one_batch_lowers_the_loss(trained):
 
 
 def test_init_has_both_stages():
-    task = Task(BOX, network(), LossConfig())
+    task = Objective(BOX, network(), LossConfig())
     shapes = jax.eval_shape(task.init, jax.random.key(0))
     assert set(shapes) == {"params", "batch_stats"}
     assert all(set(collection) == {"root", "parts"} for collection in shapes.values())

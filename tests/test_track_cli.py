@@ -21,7 +21,7 @@ from test_visualization import ARM, arm_pose
 
 from caper_jax import categories, cli
 from caper_jax.cli import realsense, track_live, track_videos
-from caper_jax.configuration import override
+from caper_jax.config import RegistrationConfig, TrackerConfig, override
 from caper_jax.data import hdf5
 from caper_jax.data.live import pack_frame, read_frames
 from caper_jax.errors import CaperError
@@ -29,9 +29,7 @@ from caper_jax.estimator import Estimator
 from caper_jax.evaluation.track_report import format_tracks, frame_record
 from caper_jax.evaluation.tracking import Track
 from caper_jax.tracker import Tracker
-from caper_jax.tracking.config import TrackerConfig
-from caper_jax.tracking.registration import RegistrationConfig
-from caper_jax.tracking.step import Tracked
+from caper_jax.tracking.step import TrackResult
 from caper_jax.visualization.track import evenly_spaced, write_states
 
 BOX = categories.get("box")
@@ -63,7 +61,7 @@ class Scripted(track_videos.Recorder):
         self.labels.append(np.arange(POINTS) % 2)
         self.number += 1
         number = self.number
-        return Tracked(pose, None, np.float32(0.01 * number), number == 2, number == 2, missing)
+        return TrackResult(pose, None, np.float32(0.01 * number), number == 2, number == 2, missing)
 
 
 @pytest.fixture
@@ -82,7 +80,7 @@ def scripted(monkeypatch):
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
-    """Two labelled videos of 5 frames, the same but for their names, and single frames."""
+    """Two labeled videos of 5 frames, the same but for their names, and single frames."""
     monkeypatch.chdir(tmp_path)
     frames = random_frames(5, POINTS)
     twice = jax.tree.map(lambda array: np.concatenate([array, array]), frames)
@@ -97,7 +95,7 @@ def run(*arguments):
     return cli.main(["track", "--category", "box", *arguments])
 
 
-def test_a_labelled_file(files, scripted, capsys):
+def test_a_labeled_file(files, scripted, capsys):
     assert run("--data", "videos.h5", "--start", "truth", "--out", "a/b") == 0
     output = capsys.readouterr().out
     assert max(map(len, output.splitlines())) <= 80
@@ -309,7 +307,7 @@ class TestReport:
     """Records and tables of any category."""
 
     def result(self, pose=None):
-        return Tracked(pose or arm_pose(), None, np.float32(0.02), True, False, False)
+        return TrackResult(pose or arm_pose(), None, np.float32(0.02), True, False, False)
 
     def test_units_and_frames(self):
         record = frame_record("f", self.result(), ARM, 0.0125)
@@ -317,7 +315,7 @@ class TestReport:
         link, slider = record["joints"]["link"], record["joints"]["slider"]
         assert (link["type"], link["unit"]) == ("revolute", "degrees")
         assert link["state"] == pytest.approx(40.107046) and link["pivot"] == [0.02, 0.05, -0.03]
-        assert (slider["type"], slider["unit"]) == ("prismatic", "metres")
+        assert (slider["type"], slider["unit"]) == ("prismatic", "meters")
         assert slider["state"] == pytest.approx(0.08) and slider["pivot"] is None
         assert slider["axis"] == [1.0, 0.0, 0.0]
         turned = np.array(record["parts"]["link"]["rotation"])

@@ -12,7 +12,7 @@ from tracks import BOX, KnownTracker, disturbed, track, write_videos
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.metrics import object_diagonal
 from caper_jax.evaluation.tracking import (
-    summarise_tracks,
+    summarize_tracks,
     track_errors,
     track_video,
 )
@@ -26,7 +26,7 @@ def video(tmp_path):
 
 
 def summary(tracks, start="truth"):
-    return summarise_tracks(tracks, BOX, start, "projection", "predicted")
+    return summarize_tracks(tracks, BOX, start, "projection", "predicted")
 
 
 def test_a_tracker_that_is_right_scores_perfectly(video):

@@ -13,14 +13,11 @@ from scipy.spatial.transform import Rotation
 from tiny import network, random_variables
 
 from caper_jax import categories, load_tracker
-from caper_jax.data.synthetic.config import GeneratorConfig
-from caper_jax.data.synthetic.videos import VideoGenerator
+from caper_jax.config import GeneratorConfig, HeadConfig, RegistrationConfig, TrackerConfig
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator
-from caper_jax.networks.heads import HeadConfig
+from caper_jax.synthetic.videos import VideoGenerator
 from caper_jax.tracker import Tracker
-from caper_jax.tracking.config import TrackerConfig
-from caper_jax.tracking.registration import RegistrationConfig
 from caper_jax.tracking.state import Observation
 from caper_jax.tracking.step import given_state
 
@@ -213,7 +210,7 @@ class TestShipped:
 
 
 def plates(frames, count=64, seed=0):
-    """[T, N, 3] metres: two plates, one of which opens, as they pass 0.8 m away."""
+    """[T, N, 3] meters: two plates, one of which opens, as they pass 0.8 m away."""
     rng = np.random.default_rng(seed)
     root = Rotation.from_rotvec([0.5, 0.3 + 0.2 * seed, 0.0])
     pivot, lid, clouds = np.array([0, 0, -0.15]), PLATES == 1, []
@@ -228,13 +225,13 @@ def plates(frames, count=64, seed=0):
 
 
 PLATES = np.arange(64) % 2  # parts of the points
-# Nothing contradicts: network, registration, estimator and keyframes all count at every frame.
+# Nothing poses_disagree: network, registration, estimator and keyframes all count at every frame.
 TRUSTING = TrackerConfig(
     registration=RegistrationConfig(gaussians=32, capacity=64, steps=1, stride=1),
     gate_deg=181.0,
     gate=1e6,
-    misfit=1e6,
-    mismatch=2.0,
+    box_residual=1e6,
+    match_cost=2.0,
     patience=1000,
 )
 
@@ -242,7 +239,7 @@ TRUSTING = TrackerConfig(
 def toy(variables=None) -> Tracker:
     """A tracker with networks that compile soon, for what holds whatever the weights are."""
     heads = HeadConfig(widths=(8, 8, 8), dropout=0.0, pool_first=True)
-    sizes = network(root_heads=heads, pooled_heads=heads, corrections=0)
+    sizes = network(root_heads=heads, pooled_heads=heads, refine_steps=0)
     estimator = Estimator(LAPTOP, sizes, variables or random_variables(LAPTOP, sizes))
     return Tracker(estimator, TRUSTING)
 
@@ -364,9 +361,9 @@ class TestMistakes:
         [
             (np.zeros((64, 4)), r"a cloud must be \[N, 3\], got \(64, 4\)"),
             (np.zeros((1, 64, 3)), r"a cloud must be \[N, 3\], got \(1, 64, 3\)"),
-            ([["a"] * 3] * 20, "must be numbers in metres"),
+            ([["a"] * 3] * 20, "must be numbers in meters"),
             ([[1, 2, 3], [1, 2]], "points is no array"),
-            (POINTS * 1000, "millimetres"),
+            (POINTS * 1000, "millimeters"),
             (POINTS * [1, -1, -1], "behind the camera"),
         ],
     )
@@ -389,8 +386,8 @@ class TestMistakes:
             (2.0, 0.8, "must hold rotation matrices"),
             (np.diag([1.0, 1.0, -1.0]), 0.8, "must hold rotation matrices"),
             (np.nan, 0.8, "must hold rotation matrices"),
-            (1.0, np.nan, "must be metres"),
-            (1.0, 800.0, "must be metres, at most 50, got 800"),
+            (1.0, np.nan, "must be meters"),
+            (1.0, 800.0, "must be meters, at most 50, got 800"),
             ("x", 0.8, "must be numbers"),
         ],
     )

@@ -15,15 +15,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
+from caper_jax.config import TrackerConfig
 from caper_jax.errors import CaperError
-from caper_jax.networks.increment import increment_numbers, increment_transform
-from caper_jax.networks.turns import NUM_TURNS, TURNS
+from caper_jax.models.increment import increment_numbers, increment_transform
+from caper_jax.models.rotation_classes import CUBE_ROTATIONS, NUM_CUBE_ROTATIONS
 from caper_jax.tracking import keyframes
-from caper_jax.tracking.config import TrackerConfig
 from caper_jax.tracking.energy import chamfer_energy
-from caper_jax.tracking.fix import Fix, averaged, diagonal, misfit
 from caper_jax.tracking.joints import joints_from_poses
-from caper_jax.tracking.state import Constants
+from caper_jax.tracking.measurement import PoseMeasurement, averaged, box_residual, diagonal
+from caper_jax.tracking.state import ObjectParameters
 
 LAPTOP = categories.get("laptop")
 # A door, and a drawer in it: of the category, only types and tree are looked at.
@@ -106,7 +106,7 @@ class TestJointsFromPoses:
         )
 
     def votes(self, axis, pivot):
-        return Constants(
+        return ObjectParameters(
             axis=np.float32(axis),
             pivot=np.float32(pivot),
             size=np.ones((3, 3), np.float32),
@@ -228,7 +228,7 @@ class TestPolicies:
     )
     def test_when_a_keyframe_is_due(self, policy, energy, unmatched, age, due):
         config = TrackerConfig(policy=policy, interval=5, threshold=0.03, unseen=0.12)
-        assert bool(keyframes.is_due(energy, unmatched, age, config)) == due
+        assert bool(keyframes.is_keyframe(energy, unmatched, age, config)) == due
 
     @pytest.mark.parametrize(
         ("settings", "message"),
@@ -243,10 +243,10 @@ class TestPolicies:
             TrackerConfig(**settings)
 
 
-def laptop_fix(root, state=0.0) -> Fix:
+def laptop_fix(root, state=0.0) -> PoseMeasurement:
     """A laptop whose boxes are 2 x 2 x 2 about the origin and 2 x 1 x 1 about y = 3."""
     lid = rigid([state, 0, 0])
-    constants = Constants(
+    constants = ObjectParameters(
         axis=np.float32([[1, 0, 0]]),
         pivot=np.zeros((1, 3), np.float32),
         size=np.float32([[2, 2, 2], [2, 1, 1]]),
@@ -254,14 +254,14 @@ def laptop_fix(root, state=0.0) -> Fix:
         seen=np.float32(1),
         known=np.zeros(1, np.float32),
     )
-    return Fix(
+    return PoseMeasurement(
         root=np.float32(root),
         joint_state=np.float32([state]),
         parts=np.float32(np.stack([np.eye(4), lid])),
         labels=POINT_LABELS,
         constants=constants,
         sure=np.float32(1),
-        turn=np.zeros(NUM_TURNS, np.float32),
+        turn=np.zeros(NUM_CUBE_ROTATIONS, np.float32),
     )
 
 
@@ -272,13 +272,13 @@ INSIDE = np.array([[0, 0, 0], [1, -1, 1], [0.9, 3.4, 0.4], [-1, 2.5, -0.5]])
 BESIDE = np.array([[0, 0, 0], [1, -1, 1.3], [1.3, 3.4, 0.9], [-1, 2.3, -0.5]])
 
 
-def in_camera(points, fix: Fix):
+def in_camera(points, fix: PoseMeasurement):
     poses = (fix.root @ fix.parts)[POINT_LABELS]
     return np.float32(np.einsum("nij,nj->ni", poses[:, :3, :3], points) + poses[:, :3, 3])
 
 
 class TestMisfit:
-    measure = staticmethod(quick_jit(misfit))
+    measure = staticmethod(quick_jit(box_residual))
 
     def test_points_in_their_boxes_fit(self):
         fix = laptop_fix(ROOT, 0.5)
@@ -303,7 +303,7 @@ def programs():
     """Settings -> compiled ``corrected``; the estimator answers with its ``variables``."""
     compiled = {}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(keyframes, "estimate_fix", lambda variables, *_: variables)
+        patch.setattr(keyframes, "estimate_measurement", lambda variables, *_: variables)
         patch.setattr(keyframes, "measure", turned_answer)
         yield compiled
 
@@ -323,7 +323,9 @@ class TestCorrected:
         def run(estimate=self.ESTIMATE, fits="track", variance=0.0, sure=0.9, **flags):
             """(turn, shift and joint state found, variance, asked, replaced)."""
             lost, due = (flags.pop(name, False) for name in ("lost", "due"))
-            doubtful = np.int32(flags.pop("doubtful", 3 * flags.pop("doubted", False)))
+            num_inconsistent = np.int32(
+                flags.pop("num_inconsistent", 3 * flags.pop("doubted", False))
+            )
             turned = np.int32(flags.pop("turned", 0))
             trial = flags.pop("trial", 0)
             turn, shift, state = estimate
@@ -332,11 +334,11 @@ class TestCorrected:
             key = tuple(flags.items())
             if key not in programs:
 
-                def corrected(static, points, tracked, state, due, doubtful, turned):
+                def corrected(static, points, tracked, state, due, num_inconsistent, turned):
                     state, settings = SimpleNamespace(**state), TrackerConfig(**flags)
-                    rest = due, doubtful, turned, LAPTOP, None, settings
+                    rest = due, num_inconsistent, turned, LAPTOP, None, settings
                     return keyframes.corrected(
-                        static, points, None, tracked, misfit(tracked, points), state, *rest
+                        static, points, None, tracked, box_residual(tracked, points), state, *rest
                     )
 
                 programs[key] = quick_jit(corrected)
@@ -344,9 +346,9 @@ class TestCorrected:
             state = {"variance": np.float32(variance) * np.ones(3, np.float32), "lost": lost}
             state |= {"vote": np.zeros(24, np.float32), "trial": np.int32(trial)}
             static = replace(static, sure=np.float32(sure))
-            said = programs[key](static, points, tracked, state, due, doubtful, turned)
+            said = programs[key](static, points, tracked, state, due, num_inconsistent, turned)
             fix, found = said.fix, (said.variance, said.asked, said.replaced)
-            assert said.sure == (bool(said.asked) and (sure >= 0.5 or doubtful >= 5))
+            assert said.sure == (bool(said.asked) and (sure >= 0.5 or num_inconsistent >= 5))
             assert said.vote.any() == (bool(said.sure) and trial > 0)
             along = np.linalg.inv(tracked.root) @ np.asarray(fix.root, float)
             turned = Rotation.from_matrix(along[:3, :3]).as_rotvec()[1]
@@ -412,9 +414,9 @@ class TestCorrected:
             found, _, asked, replaced = run(variance=0.1, sure=0.4, **flags)
             np.testing.assert_allclose(found, self.TRACK, atol=1e-6)
             assert asked and not replaced
-        found, *_, replaced = run(sure=0.4, doubtful=4, fits="estimate")
+        found, *_, replaced = run(sure=0.4, num_inconsistent=4, fits="estimate")
         assert not replaced
-        found, *_, replaced = run(sure=0.4, doubtful=5, fits="estimate")
+        found, *_, replaced = run(sure=0.4, num_inconsistent=5, fits="estimate")
         np.testing.assert_allclose(found, self.ESTIMATE, atol=1e-5)
         assert replaced
         found, _, asked, replaced = run(sure=0.4, lost=True)
@@ -423,7 +425,7 @@ class TestCorrected:
 
     def test_a_track_off_by_a_turn_is_turned_unasked(self, run):
         quarter = Rotation.from_euler("y", 90, degrees=True).as_matrix()
-        (turn,) = np.flatnonzero(np.isclose(TURNS, quarter, atol=1e-6).all((1, 2)))
+        (turn,) = np.flatnonzero(np.isclose(CUBE_ROTATIONS, quarter, atol=1e-6).all((1, 2)))
         found, variance, asked, replaced = run(turned=turn)
         np.testing.assert_allclose(found, [np.pi / 2, 0, self.ESTIMATE[2]], atol=1e-5)
         np.testing.assert_allclose(variance, self.STATIC, rtol=1e-5)
@@ -439,11 +441,11 @@ class TestAveraged:
     mean = staticmethod(quick_jit(averaged))
 
     def frames(self, count):
-        """Constants of two joints, as noisy as networks see them."""
+        """ObjectParameters of two joints, as noisy as networks see them."""
         rng = np.random.default_rng(3)
         for _ in range(count):
             axis = np.array([[1, 0, 0], [0, 0, 1]]) + 0.1 * rng.normal(size=(2, 3))
-            yield Constants(
+            yield ObjectParameters(
                 axis=np.float32(axis / np.linalg.norm(axis, axis=1, keepdims=True)),
                 pivot=np.float32(rng.normal(size=(2, 3))),
                 size=np.float32(rng.uniform(1, 2, (3, 3))),

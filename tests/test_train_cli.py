@@ -15,11 +15,10 @@ import numpy as np
 import pytest
 
 from caper_jax import categories, cli
-from caper_jax.configuration import to_dict, update
-from caper_jax.data.loader import LoaderConfig
+from caper_jax.config import LoaderConfig, to_dict, update
 from caper_jax.errors import CaperError
-from caper_jax.model_files import read_model, write_card, write_model
-from caper_jax.training import run
+from caper_jax.models.files import read_model, write_card, write_model
+from caper_jax.training import train as run
 from caper_jax.visualization.curves import training_curves
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -192,7 +191,7 @@ def test_a_model_can_start_another_run(model, tmp_path):
 def test_a_model_can_be_averaged_with_what_it_becomes(model, tmp_path, capsys):
     begin = ["train", *TINY, "--steps", "10", "--from", str(model)]
     for name, share in (("whole", 0.0), ("mixed", 0.75)):
-        out = ["--set", f"start_share={share}", "--out", str(tmp_path / name)]
+        out = ["--set", f"init_weight_average={share}", "--out", str(tmp_path / name)]
         assert cli.main([*begin, *out]) == 0
     first, whole, mixed = (
         read_model(at)[1] for at in (model, tmp_path / "whole", tmp_path / "mixed")
@@ -206,11 +205,13 @@ def test_a_model_can_be_averaged_with_what_it_becomes(model, tmp_path, capsys):
     new = {"params": {"head": {"kernel": np.ones(3, np.float32)}}}
     jax.tree.map(np.testing.assert_array_equal, run.averaged(first, new, 0.75), new)
 
-    no_start = ["train", *TINY, "--steps", "10", "--set", "start_share=0.5"]
+    no_start = ["train", *TINY, "--steps", "10", "--set", "init_weight_average=0.5"]
     assert cli.main([*no_start, "--out", str(tmp_path / "none")]) == 2
-    assert "start_share = 0.5 needs a model of 'box' to start from" in capsys.readouterr().err
-    with pytest.raises(CaperError, match=r"start_share must be in \[0, 1\), got 1.0"):
-        replace(run.preset("fast", "box"), start_share=1.0)
+    assert (
+        "init_weight_average = 0.5 needs a model of 'box' to start from" in capsys.readouterr().err
+    )
+    with pytest.raises(CaperError, match=r"init_weight_average must be in \[0, 1\), got 1.0"):
+        replace(run.preset("fast", "box"), init_weight_average=1.0)
 
 
 def test_a_run_from_a_model_has_its_network(model, tmp_path, monkeypatch):
@@ -238,7 +239,7 @@ def test_a_run_from_a_published_network_is_of_that_preset(tmp_path):
     write_model(tmp_path, {}, {"run": {"network": network}})
     config = run.preset_of(tmp_path, "box")
     paper = run.preset("paper", "box")
-    assert config == replace(paper, network=replace(paper.network, corrections=2))
+    assert config == replace(paper, network=replace(paper.network, refine_steps=2))
 
 
 def test_all_categories_one_after_the_other(model, tmp_path, monkeypatch):
@@ -298,12 +299,18 @@ def test_every_configuration_file_is_valid(name):
         ("network.fast.width=0", "network.fast.width must be at least 1, got 0"),
         ("network.fast.scales=[0.1, 0.0]", "network.fast.scales must be at least 0.001"),
         ("network.fast.scales=[]", "network.fast.scales must not be empty"),
-        ("network.turn_margin=nan", "network.turn_margin must be at least 0, got nan"),
+        (
+            "network.rotation_classifier.margin=nan",
+            "network.rotation_classifier.margin must be at least 0, got nan",
+        ),
         ("network.point_heads.dropout=1.0", "network.point_heads.dropout must be below 1, got 1.0"),
         ("network.root_heads.widths=[0,1,1]", "network.root_heads.widths must be at least 1"),
         ("network.point_stride=200", "network.point_stride must be at most network.num_points"),
         ("loss.state_penalty=inf", "loss.state_penalty must be finite and at least 0, got inf"),
-        ("network.turn_width=-1", "network.turn_width must be at least 0, got -1"),
+        (
+            "network.rotation_classifier.width=-1",
+            "network.rotation_classifier.width must be at least 0, got -1",
+        ),
         ("loss.weights.twist=-1", "loss.weights.twist must be at least 0, got -1.0"),
         ("loss.root_noise=nan", "loss.root_noise must be at least 0, got nan"),
         ("loss.turned=1.5", "loss.turned is a fraction from 0 to 1, got 1.5"),
@@ -311,7 +318,7 @@ def test_every_configuration_file_is_valid(name):
     ],
 )
 def test_what_cannot_be_done_is_said_before_a_run_begins(setting, message, tmp_path, capsys):
-    arguments = ["train", *TINY, "--set", "network.sides_width=16", "--set", setting]
+    arguments = ["train", *TINY, "--set", "network.refiner.width=16", "--set", setting]
     assert cli.main([*arguments, "--steps", "1", "--out", str(tmp_path / "run")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

@@ -17,13 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from caper_jax.config import TrainingConfig
 from caper_jax.errors import CaperError
 from caper_jax.training import loop
-from caper_jax.training.loop import TrainingConfig, fit
+from caper_jax.training.loop import fit
 from caper_jax.training.metrics_log import read_metrics
 from caper_jax.training.optimizer import Optimizer, flat_and_anneal
 from caper_jax.training.run_directory import check_configuration
-from caper_jax.training.state import TrainState, make_step, step_keys
+from caper_jax.training.step import TrainState, make_step, step_keys
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 BATCH = 8

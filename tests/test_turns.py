@@ -15,48 +15,58 @@ from test_networks import normal, variables_of
 from test_task import BOX, CABINET, DEEP, THIN, frames
 from tiny import network, random_variables
 
+from caper_jax.config import LossConfig, RotationClassifierConfig
 from caper_jax.estimator import estimate
-from caper_jax.geometry import so3
-from caper_jax.networks import turns
-from caper_jax.networks.canonical import part_points
-from caper_jax.networks.caper import PartsNetwork, RootNetwork, quaternion_axes
-from caper_jax.networks.voting import vote
-from caper_jax.training.task import LossConfig, Task
+from caper_jax.geometry.frames import part_points
+from caper_jax.lie import so3
+from caper_jax.models import rotation_classes
+from caper_jax.models.networks import PartsNetwork, RootNetwork, quaternion_axes
+from caper_jax.models.voting import vote
+from caper_jax.training.objective import Objective
 
 
 def test_turns_are_the_rotations_of_the_cube():
     cube = Rotation.create_group("O").as_matrix()
-    found = {tuple(np.round(turn).astype(int).ravel()) for turn in turns.TURNS}
+    found = {tuple(np.round(turn).astype(int).ravel()) for turn in rotation_classes.CUBE_ROTATIONS}
     assert found == {tuple(np.round(turn).astype(int).ravel()) for turn in cube}
-    np.testing.assert_array_equal(turns.TURNS[0], np.eye(3))
-    axes = sorted(Rotation.from_matrix(turns.TURNS[i]).magnitude() for i in turns.HALF_TURNS)
+    np.testing.assert_array_equal(rotation_classes.CUBE_ROTATIONS[0], np.eye(3))
+    axes = sorted(
+        Rotation.from_matrix(rotation_classes.CUBE_ROTATIONS[i]).magnitude()
+        for i in rotation_classes.HALF_TURNS
+    )
     np.testing.assert_allclose(axes, np.pi)
 
 
 def test_the_turn_between_two_rotations_is_the_nearest():
     rng = np.random.default_rng(0)
     one, other = Rotation.random(50, rng=rng), Rotation.random(50, rng=rng)
-    index, angle = turns.turn_between(
+    index, angle = rotation_classes.nearest_cube_rotation(
         jnp.asarray(one.as_matrix(), jnp.float32), jnp.asarray(other.as_matrix(), jnp.float32)
     )
     off = np.stack(
-        [((one * Rotation.from_matrix(t)).inv() * other).magnitude() for t in turns.TURNS], 1
+        [
+            ((one * Rotation.from_matrix(t)).inv() * other).magnitude()
+            for t in rotation_classes.CUBE_ROTATIONS
+        ],
+        1,
     )
     np.testing.assert_array_equal(index, off.argmin(1))
     np.testing.assert_allclose(angle, off.min(1), atol=1e-3)
 
 
 def test_a_turn_must_lead_by_the_margin():
-    logits = jnp.zeros((3, turns.NUM_TURNS)).at[:, 0].set(1.0)
+    logits = jnp.zeros((3, rotation_classes.NUM_CUBE_ROTATIONS)).at[:, 0].set(1.0)
     logits = logits.at[1, 5].set(1.9).at[2, 5].set(2.1)
-    found = turns.chosen_turn(logits, margin=1.0)
+    found = rotation_classes.select_rotation(logits, margin=1.0)
     for row, turn in zip(found, (0, 0, 5), strict=True):
-        np.testing.assert_array_equal(row, turns.TURNS[turn])
+        np.testing.assert_array_equal(row, rotation_classes.CUBE_ROTATIONS[turn])
 
 
 def turning_task(category=BOX, **config):
-    sizes = dataclasses.replace(network("fast", pool_first=True), turn_width=8)
-    return Task(category, sizes, LossConfig(**config))
+    sizes = dataclasses.replace(
+        network("fast", pool_first=True), rotation_classifier=RotationClassifierConfig(8)
+    )
+    return Objective(category, sizes, LossConfig(**config))
 
 
 def predicting(made, batch, turn):
@@ -76,8 +86,8 @@ def test_references_are_turned_on_purpose_and_say_so():
     reference, turn = made._turned(key, reference, turn)
     turn = np.asarray(turn)
     assert 0.3 < (turn > 0).mean() < 0.5
-    assert 0.4 < np.isin(turn[turn > 0], turns.HALF_TURNS).mean() < 0.8
-    mended = np.asarray(reference)[:, :3, :3] @ turns.TURNS[turn]
+    assert 0.4 < np.isin(turn[turn > 0], rotation_classes.HALF_TURNS).mean() < 0.8
+    mended = np.asarray(reference)[:, :3, :3] @ rotation_classes.CUBE_ROTATIONS[turn]
     off = so3.geodesic_distance(jnp.asarray(mended), truth.rotation[:, 0])
     assert np.degrees(off).max() < 30  # the noise alone
 
@@ -88,7 +98,9 @@ def test_predictions_that_are_turned_are_references_with_their_turn():
     half = np.diag([-1.0, 1.0, -1.0]).astype(np.float32)  # about y
     truth, output = predicting(made, batch, half)
     reference, turn = made._noisy_root(jax.random.key(0), output, truth)
-    np.testing.assert_array_equal(turns.TURNS[np.asarray(turn)], np.tile(half, (100, 1, 1)))
+    np.testing.assert_array_equal(
+        rotation_classes.CUBE_ROTATIONS[np.asarray(turn)], np.tile(half, (100, 1, 1))
+    )
     np.testing.assert_allclose(reference[:, :3, :3], truth.rotation[:, 0] @ half, atol=1e-6)
 
 
@@ -128,7 +140,9 @@ def test_what_is_logged_is_of_references_that_are_not_turned(monkeypatch):
 
 def test_the_estimator_makes_the_turn_that_stage_two_asks_for():
     """A head with a constant answer turns every root by it, about the root's origin."""
-    config = dataclasses.replace(network("fast", pool_first=True), turn_width=8)
+    config = dataclasses.replace(
+        network("fast", pool_first=True), rotation_classifier=RotationClassifierConfig(8)
+    )
     variables = random_variables(BOX, config)
     head = variables["params"]["parts"]["turn"]
     last = head[f"Dense_{len(head) - 1}"]
@@ -141,11 +155,14 @@ def test_the_estimator_makes_the_turn_that_stage_two_asks_for():
             layer["kernel"], layer["bias"] = layer["kernel"] * 0, layer["bias"] * 0
         return estimate(variables, points.astype(jnp.float32), BOX, config).pose
 
-    plain = roots(np.zeros(turns.NUM_TURNS, np.float32))
-    bias = np.zeros(turns.NUM_TURNS, np.float32)
-    bias[turns.HALF_TURNS[1]] = 5.0
+    plain = roots(np.zeros(rotation_classes.NUM_CUBE_ROTATIONS, np.float32))
+    bias = np.zeros(rotation_classes.NUM_CUBE_ROTATIONS, np.float32)
+    bias[rotation_classes.HALF_TURNS[1]] = 5.0
     turned = roots(bias)
-    expected = np.asarray(plain.rotation[:, 0]) @ turns.TURNS[turns.HALF_TURNS[1]]
+    expected = (
+        np.asarray(plain.rotation[:, 0])
+        @ rotation_classes.CUBE_ROTATIONS[rotation_classes.HALF_TURNS[1]]
+    )
     np.testing.assert_allclose(turned.rotation[:, 0], expected, atol=1e-5)
     np.testing.assert_allclose(turned.translation[:, 0], plain.translation[:, 0], atol=1e-6)
 
@@ -169,7 +186,7 @@ def test_ablations_of_stage_one(change):
         np.testing.assert_allclose(right, 0.0, atol=1e-5)
     else:  # the first direction stays, the second gives way
         np.testing.assert_array_equal(found.confidence, [[1.0, 0.0]] * 2)
-    made = Task(BOX, config, LossConfig())
+    made = Objective(BOX, config, LossConfig())
     assert set(made._root_losses(found, frames(BOX, [THIN, THIN]).pose)) == {
         "rotation",
         "translation",
@@ -195,7 +212,7 @@ def test_direct_joints_are_what_the_votes_come_to():
 def test_direct_joints_find_back_from_the_opposite_axis():
     """The loss of a unit vector has no slope there."""
     config = dataclasses.replace(network("fast", pool_first=True), joints="direct")
-    made = Task(BOX, config, LossConfig())
+    made = Objective(BOX, config, LossConfig())
     batch = frames(BOX, [DEEP, DEEP])
     truth = made._targets(batch.pose, jnp.broadcast_to(jnp.eye(3), (2, 3, 3)))
     ones = jnp.ones(batch.labels.shape)[..., None]

@@ -17,20 +17,20 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
 from caper_jax.articulation.kinematics import forward_kinematics
-from caper_jax.data.synthetic.bank import draw_models
 from caper_jax.data.urdf.export import part_mesh, write_urdf
 from caper_jax.errors import CaperError
 from caper_jax.geometry.solid_bounds import bounds
 from caper_jax.geometry.solids import box, cone, cylinder, ellipsoid, frustum
+from caper_jax.synthetic.instances import draw_instances
 
 NAMES = ("laptop", "drawer", "robotarm")
 
 
 @pytest.fixture(scope="module", params=NAMES)
 def exported(request, tmp_path_factory):
-    """(category, centred model, path of its URDF)."""
+    """(category, centered model, path of its URDF)."""
     category = categories.get(request.param)
-    (model,) = draw_models(category, 1, "test", 2)
+    (model,) = draw_instances(category, 1, "test", 2)
     folder = tmp_path_factory.mktemp(request.param) / "new" / "0"
     return category, model, write_urdf(folder, model, category, "thing", sections=32)
 
@@ -124,7 +124,7 @@ def test_united_or_side_by_side():
 
 def test_an_object_is_not_overwritten_by_accident(tmp_path):
     category = categories.get("laptop")
-    first, second = draw_models(category, 2, "test", 0)
+    first, second = draw_instances(category, 2, "test", 0)
     path = write_urdf(tmp_path, first, category, "first", sections=8)
     before = path.read_bytes()
     with pytest.raises(CaperError, match="exists"):
@@ -135,7 +135,7 @@ def test_an_object_is_not_overwritten_by_accident(tmp_path):
 
 
 def test_a_model_of_another_category_is_refused(tmp_path):
-    (model,) = draw_models(categories.get("laptop"), 1, "test", 0)
+    (model,) = draw_instances(categories.get("laptop"), 1, "test", 0)
     with pytest.raises(CaperError, match="robotarm"):
         write_urdf(tmp_path, model, categories.get("robotarm"), "thing")
     assert not list(tmp_path.iterdir())

@@ -27,13 +27,13 @@ from caper_jax import categories
 from caper_jax.categories.drawer import DRAWER
 from caper_jax.categories.laptop import LAPTOP
 from caper_jax.categories.robotarm import ROBOTARM
-from caper_jax.data.synthetic.bank import draw_models
 from caper_jax.data.urdf.canonical import ImportOptions, bring, import_urdf
 from caper_jax.data.urdf.export import write_urdf
 from caper_jax.data.urdf.load import UrdfJoint, UrdfModel, read_urdf
 from caper_jax.data.urdf.meshes import Mesh, join
 from caper_jax.data.urdf.parts import map_parts
 from caper_jax.data.urdf.reference import Reference
+from caper_jax.synthetic.instances import draw_instances
 
 # Canonical axes -> those of a file with z up and x to the front, as in robotics.
 Z_UP = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], float)
@@ -106,13 +106,13 @@ def _file_axis(robot, joint):
 
 
 def test_partnet_laptop_by_hand(tmp_path):
-    """Modelled 110 deg open, closing is positive in the file; the rest pose is at +20 deg."""
+    """Modeled 110 deg open, closing is positive in the file; the rest pose is at +20 deg."""
     item = import_urdf(partnet_laptop(tmp_path / "101"), LAPTOP)
     assert item.name == "101"
     width, thick, depth = LAPTOP_BASE
     _, height, lid = LAPTOP_LID
     np.testing.assert_allclose(item.size, [LAPTOP_BASE, LAPTOP_LID], atol=1e-6)
-    # The hinge is at the top back edge of the base, the lid stands behind it, centred at -lid / 2.
+    # The hinge is at the top back edge of the base, the lid stands behind it, centered at -lid / 2.
     low = np.array([-width / 2, -thick / 2, -depth / 2 - lid])
     high = np.array([width / 2, thick / 2 + height, depth / 2])
     middle = (low + high) / 2
@@ -141,7 +141,7 @@ def test_partnet_drawer_by_hand(tmp_path):
 
 
 def test_links_that_mimic_a_joint_are_at_its_rest(tmp_path):
-    """A flap in the lid of a laptop modelled shut: upright when shut, flat at rest, 90 deg open."""
+    """A flap in the lid of a laptop modeled shut: upright when shut, flat at rest, 90 deg open."""
     robot = Robot(tmp_path).link("base", ((0.12, 0, -0.01), (0.24, 0.34, 0.02)))
     robot.link("lid", ((0.12, 0, 0.005), (0.24, 0.34, 0.01)))
     robot.link("flap", ((0, 0, 0), (0.02, 0.02, 0.06)))
@@ -166,7 +166,7 @@ def test_arm_merges_wrist_and_fingers(tmp_path):
 
 
 def as_urdf(model, category, turn, state):
-    """A generated object as a URDF would hold it: axes turned, modelled at a state."""
+    """A generated object as a URDF would hold it: axes turned, modeled at a state."""
     pose = np.eye(4)
     pose[:3, :3] = turn
     meshes = [part_mesh(solids) for solids in model.parts]
@@ -208,7 +208,7 @@ def test_frames_and_rest_poses_are_found(name, monkeypatch):
 
     monkeypatch.setattr(solid_meshes, "SECTIONS", 24)
     category = categories.get(name)
-    for index, model in enumerate(draw_models(category, 6, "test", 11)):
+    for index, model in enumerate(draw_instances(category, 6, "test", 11)):
         shut = model.limits[:, 0]
         states = [0 * shut] if name == "robotarm" else [0 * shut, shut, model.limits[:, 1]]
         for turn in (np.eye(3), Z_UP):
@@ -231,7 +231,7 @@ def test_frames_and_rest_poses_are_found(name, monkeypatch):
 def test_up_is_where_drawers_follow_one_another():
     """Cabinets with y up and the front to x, against the convention of z up."""
     turn = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], float)
-    for model in draw_models(DRAWER, 6, "test", 11):
+    for model in draw_instances(DRAWER, 6, "test", 11):
         item = bring(as_urdf(model, DRAWER, turn, np.zeros(3)), DRAWER, ImportOptions())
         np.testing.assert_allclose(item.reference.axis, model.axis, atol=1e-6)
         np.testing.assert_allclose(item.reference.pivot, _centered(model), atol=0.002)
@@ -248,7 +248,7 @@ def test_up_is_assumed_where_drawers_stand_side_by_side(tmp_path):
 
 
 def _centered(model):
-    """Pivots from the centre of the meshes' box (24-sided cylinders are a little smaller)."""
+    """Pivots from the center of the meshes' box (24-sided cylinders are a little smaller)."""
     meshes = [part_mesh(solids) for solids in model.parts]
     low = np.min([mesh.bounds[0] for mesh in meshes], axis=0)
     high = np.max([mesh.bounds[1] for mesh in meshes], axis=0)
@@ -259,7 +259,7 @@ def _centered(model):
 def test_exported_objects_come_back(name, tmp_path):
     """Exported and imported: the same frame, joints and sizes."""
     category = categories.get(name)
-    for index, model in enumerate(draw_models(category, 2, "test", 12)):
+    for index, model in enumerate(draw_instances(category, 2, "test", 12)):
         path = write_urdf(tmp_path / str(index), model, category, f"{name}{index}", sections=16)
         item = import_urdf(path, category)
         np.testing.assert_allclose(item.reference.axis, model.axis, atol=1e-5)

@@ -18,16 +18,16 @@ from urdf_models import partnet_drawer, partnet_laptop
 
 from caper_jax.categories.laptop import LAPTOP
 from caper_jax.cli import common, generate
-from caper_jax.data import open_dataset
-from caper_jax.data.schema import validate
-from caper_jax.data.synthetic.bank import build_bank, draw_models
-from caper_jax.data.synthetic.caster import cast
-from caper_jax.data.synthetic.scene import draw_state_and_poses
+from caper_jax.data.readers import open_dataset
+from caper_jax.data.types import validate
 from caper_jax.data.urdf.canonical import ImportedObject
 from caper_jax.data.urdf.meshes import Mesh
 from caper_jax.data.urdf.reference import Reference
-from caper_jax.data.urdf.render import PartCaster, render_frames
 from caper_jax.errors import CaperError
+from caper_jax.synthetic.frames import draw_state_and_poses
+from caper_jax.synthetic.instances import build_bank, draw_instances
+from caper_jax.synthetic.ray_casting import cast
+from caper_jax.synthetic.urdf_frames import PartCaster, render_frames
 
 FRAMES, GRID, POINTS = 4, 40, 300
 
@@ -47,7 +47,7 @@ def generated(model, category, name="it"):
 @pytest.fixture(scope="module")
 def rendered():
     """(models, clean frames) of two generated laptops rendered from their meshes."""
-    models = draw_models(LAPTOP, 2, "test", 5)
+    models = draw_instances(LAPTOP, 2, "test", 5)
     items = [generated(model, LAPTOP) for model in models]
     batch = render_frames(items, FRAMES, noise="none", num_points=POINTS, grid=GRID, seed=3)
     return models, batch

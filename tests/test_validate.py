@@ -12,7 +12,7 @@ from PIL import Image
 
 from caper_jax import cli
 from caper_jax.cli.validate import format_report
-from caper_jax.data.artimage import ArtImageDataset
+from caper_jax.data.readers.artimage import ArtImageDataset
 from caper_jax.data.validation import CategoryReport, Problem
 
 

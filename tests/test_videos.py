@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax import categories, cli
 from caper_jax.articulation.category import Viewpoint
+from caper_jax.config import GeneratorConfig
 from caper_jax.data.hdf5 import Hdf5Dataset
-from caper_jax.data.schema import pose_problems, validate
-from caper_jax.data.synthetic.camera import camera_arc, camera_pose, draw_camera
-from caper_jax.data.synthetic.config import GeneratorConfig
-from caper_jax.data.synthetic.videos import MODES, VideoGenerator, video
-from caper_jax.data.synthetic.views import clip
+from caper_jax.data.types import pose_problems, validate
 from caper_jax.errors import CaperError
+from caper_jax.synthetic.camera import camera_arc, camera_pose, draw_camera
+from caper_jax.synthetic.videos import MODES, VideoGenerator, video
+from caper_jax.synthetic.views import clip
 
 LAPTOP = categories.get("laptop")
 URDF = "no_such.urdf"
@@ -68,15 +68,15 @@ def test_the_camera_of_the_paper_stands_still(batches):
 def test_a_moving_camera_keeps_its_measure(batches):
     """0.3 to 1.3 deg per frame; the distance changes by up to 15 % over the clip."""
     pose = batches["cam"][1].pose
-    degrees, metres = per_frame(pose)
+    degrees, meters = per_frame(pose)
     assert degrees.min() > 0.25 and degrees.max() < 1.5
-    # A smooth arc: no frame moves much more than its neighbours.
+    # A smooth arc: no frame moves much more than its neighbors.
     assert (degrees[:, 1:] / degrees[:, :-1]).max() < 1.1
     distance = np.linalg.norm(pose.translation[:, :, 0], axis=-1)
     change = distance[:, -1] / distance[:, 0]
     assert change.min() > 0.85 - 1e-3 and change.max() < 1 / 0.85 + 1e-3
     assert (np.abs(change - 1) > 0.03).all()
-    assert 0.0005 < np.median(metres) < 0.01
+    assert 0.0005 < np.median(meters) < 0.01
 
 
 def test_hard_videos_reverse_and_move_twice_as_fast(batches):
@@ -130,7 +130,7 @@ def test_frames_are_sampled_afresh_and_the_same_key_repeats_them(batches):
 
 
 def test_cameras_may_be_turned_about_their_axes():
-    level, turned = Viewpoint(), Viewpoint(mean_roll=90.0)
+    level, turned = Viewpoint(), Viewpoint(camera_roll=90.0)
     keys = jax.random.split(jax.random.key(0), 20)
     for key in keys:
         one, other = (draw_camera(key, view).replace(aside=np.zeros(2)) for view in (level, turned))
@@ -142,7 +142,7 @@ def test_cameras_may_be_turned_about_their_axes():
 
 def test_cameras_of_arcs_stay_in_their_ranges():
     ranges = {"azimuth": (-20.0, 60.0), "elevation": (30.0, 33.0), "distance": (2.0, 2.5)}
-    view = Viewpoint(**ranges, mean_roll=40.0)
+    view = Viewpoint(**ranges, camera_roll=40.0)
 
     def arc(key):
         draw, move = jax.random.split(key)

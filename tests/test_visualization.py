@@ -159,7 +159,7 @@ def test_joint_segments_are_the_lines_that_the_joint_leaves_in_place():
     np.testing.assert_allclose(slide / np.linalg.norm(slide), further / 0.1, atol=1e-9)
 
 
-def test_picture_shows_every_part_in_its_colour(tmp_path: Path):
+def test_picture_shows_every_part_in_its_color(tmp_path: Path):
     path = write_picture(tmp_path / "new" / "picture.png", [arm_scene()])
     pixels = read_png(path).reshape(-1, 3)
     for part in range(3):

@@ -8,16 +8,17 @@ import jax
 import numpy as np
 
 from caper_jax.articulation.category import Category
-from caper_jax.networks.caper import NetworkConfig
-from caper_jax.networks.fast_encoder import FastEncoderConfig
-from caper_jax.networks.heads import HeadConfig
-from caper_jax.networks.hs_encoder import HSEncoderConfig
-from caper_jax.training.task import LossConfig, Task
-
-HS = HSEncoderConfig(channels=(4, 4, 8, 8, 16), neighbours=4, supports=2)
-FAST = FastEncoderConfig(
-    centers=16, centers_in_use=16, scales=(0.2, 0.4), width=8, blocks=1, last=8
+from caper_jax.config import (
+    FastEncoderConfig,
+    HeadConfig,
+    HSEncoderConfig,
+    LossConfig,
+    NetworkConfig,
 )
+from caper_jax.training.objective import Objective
+
+HS = HSEncoderConfig(channels=(4, 4, 8, 8, 16), neighbors=4, supports=2)
+FAST = FastEncoderConfig(centers=16, eval_centers=16, scales=(0.2, 0.4), width=8, blocks=1, last=8)
 
 
 def network(encoder: str = "fast", pool_first: bool = False, **changes: Any) -> NetworkConfig:
@@ -50,5 +51,5 @@ def random_like(shapes: Any, seed: int = 0) -> Any:
 
 def random_variables(category: Category, config: NetworkConfig, seed: int = 0) -> Any:
     """{"params": {"root", "parts"}, "batch_stats": {...}} as training would leave them."""
-    task = Task(category, config, LossConfig())
+    task = Objective(category, config, LossConfig())
     return random_like(jax.eval_shape(task.init, jax.random.key(0)), seed)

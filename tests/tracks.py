@@ -12,7 +12,7 @@ from caper_jax import categories
 from caper_jax.data import hdf5
 from caper_jax.evaluation.metrics import object_diagonal
 from caper_jax.evaluation.tracking import Track
-from caper_jax.tracking.step import Tracked
+from caper_jax.tracking.step import TrackResult
 
 BOX = categories.get("box")
 
@@ -72,14 +72,14 @@ class KnownTracker:
     def reset(self, points=None, rotation=None, translation=None, labels=None) -> None:
         self.resets.append(points is not None)
 
-    def __call__(self, points, labels=None) -> Tracked:
+    def __call__(self, points, labels=None) -> TrackResult:
         frame = self._frames[points.tobytes()]
         first = frame.name in self._first
         degrees, share = (90.0, 5.0) if first else (self._degrees, self._share)
         truth = replace(frame.truth, **{k: v[None] for k, v in vars(frame.truth).items()})
         pose = disturbed(truth, degrees, share)
         self.labels.append(labels is not None)
-        return Tracked(
+        return TrackResult(
             pose=replace(pose, **{k: v[0] for k, v in vars(pose).items()}),
             labels=None,
             energy=0.0,

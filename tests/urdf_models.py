@@ -22,7 +22,7 @@ class Robot:
         (folder / "meshes").mkdir(parents=True, exist_ok=True)
 
     def link(self, name: str, *boxes, origin="0 0 0", prefix="", suffix=".obj") -> Robot:
-        """A link with one mesh per box: (centre [3], size [3], optional rotation [3, 3])."""
+        """A link with one mesh per box: (center [3], size [3], optional rotation [3, 3])."""
         visuals = []
         for index, (center, size, *turn) in enumerate(boxes):
             pose = np.eye(4)
@@ -83,7 +83,7 @@ LAPTOP_BASE, LAPTOP_LID = (1.3, 0.06, 0.9), (1.3, 0.8, 0.04)
 
 
 def partnet_laptop(folder: Path) -> Path:
-    """Modelled 110 deg open; a positive state closes it, from -40 to 110 deg."""
+    """Modeled 110 deg open; a positive state closes it, from -40 to 110 deg."""
     # Raw PartNet axes. The hinge runs along x through (0, 0.03, -0.45), the lid's box stands on it
     # in the open position: leaning back by 20 deg.
     hinge = np.array([0.0, 0.03, -0.45])

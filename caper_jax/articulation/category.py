@@ -20,7 +20,7 @@ class Joint:
     Attributes:
       type: "revolute" or "prismatic".
       parent: index of the part it is mounted on (0 is the root).
-      limits: (low, high) of the state used for training, radians or metres from the rest pose.
+      limits: (low, high) of the state used for training, radians or meters from the rest pose.
     """
 
     type: JointType
@@ -29,7 +29,7 @@ class Joint:
 
 
 @dataclass(frozen=True)
-class Equivalence:
+class Symmetry:
     """A second, equally right reading of the same object (a declared ambiguity).
 
     The pose of part k reads ``T'_k = T_permutation[k] @ S`` with S the rotation ``turn`` about the
@@ -54,10 +54,10 @@ class ObjectModel:
     """One instance: solids per part at rest, and its joints.
 
     Attributes:
-      parts: K lists of solids, in one common frame at rest; metres.
+      parts: K lists of solids, in one common frame at rest; meters.
       axis: [K-1, 3] unit joint axes in that frame; positive opens.
       pivot: [K-1, 3] points on the axes.
-      limits: [K-1, 2] range of the states of this instance, radians or metres.
+      limits: [K-1, 2] range of the states of this instance, radians or meters.
     """
 
     parts: list[list[Solid]]
@@ -74,8 +74,8 @@ class Viewpoint:
       up: the canonical axis that points away from the table, "y" for all but lying objects.
       azimuth: degrees, full circle by default; 0 looks at the front (+z).
       elevation: degrees above the table.
-      roll: degrees, either side of ``mean_roll``.
-      mean_roll: degrees by which things that stand upright are turned clockwise in the image.
+      roll: degrees, either side of ``camera_roll``.
+      camera_roll: degrees by which things that stand upright are turned clockwise in the image.
       distance: in object diagonals.
       either_side: the object lies on its one side as often as on the other, so that cameras above
         the table look at either.
@@ -85,7 +85,7 @@ class Viewpoint:
     azimuth: tuple[float, float] = (-180.0, 180.0)
     elevation: tuple[float, float] = (5.0, 80.0)
     roll: float = 15.0
-    mean_roll: float = 0.0
+    camera_roll: float = 0.0
     distance: tuple[float, float] = (1.5, 6.0)
     either_side: bool = False
 
@@ -100,12 +100,12 @@ class Category:
       joints: K - 1 joints; joint j carries part j + 1.
       directions: the two axes of the root's frame that stage I regresses (paper Fig. 4).
       directions_reason: why these two.
-      unit: network units per metre; inputs and outputs of the public interface are metres.
-      mean_size: [K, 3] metres, mean part sizes of the training instances (paper Sec 5.2.3).
-      mean_center: [K, 3] metres, mean box centres in the rest-canonical frame.
+      unit: network units per meter; inputs and outputs of the public interface are meters.
+      mean_size: [K, 3] meters, mean part sizes of the training instances (paper Sec 5.2.3).
+      mean_center: [K, 3] meters, mean box centers in the rest-canonical frame.
       shape: draws an instance from a numpy generator; None when only real data exist.
       viewpoint: cameras of generated frames.
-      equivalences: declared ambiguities.
+      symmetries: declared ambiguities.
       closed: the limit at which a joint is closed; None where that means nothing.
     """
 
@@ -119,7 +119,7 @@ class Category:
     mean_center: tuple[tuple[float, float, float], ...]
     shape: Callable[[np.random.Generator], ObjectModel] | None = None
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
-    equivalences: tuple[Equivalence, ...] = ()
+    symmetries: tuple[Symmetry, ...] = ()
     closed: Literal["low", "high"] | None = "low"
 
     @property
@@ -141,7 +141,7 @@ class Category:
 
     @property
     def state_units(self) -> np.ndarray:
-        """[K-1] network units per metre (prismatic joints), 1 (revolute ones)."""
+        """[K-1] network units per meter (prismatic joints), 1 (revolute ones)."""
         return np.array([self.unit if t == "prismatic" else 1.0 for t in self.joint_types])
 
     def scaled(self, factor: float) -> Category:
@@ -193,8 +193,8 @@ class Category:
             raise CaperError(f"camera roll must be finite, in degrees, got {degrees}")
         if degrees == 0.0:
             return self
-        mean_roll = self.viewpoint.mean_roll + degrees
-        return replace(self, viewpoint=replace(self.viewpoint, mean_roll=mean_roll))
+        camera_roll = self.viewpoint.camera_roll + degrees
+        return replace(self, viewpoint=replace(self.viewpoint, camera_roll=camera_roll))
 
     def __post_init__(self) -> None:
         from caper_jax.errors import CaperError, unknown_name
@@ -226,12 +226,12 @@ class Category:
             raise CaperError(f"{where}: unit and mean_size must be positive")
         if self.closed not in ("low", "high", None):
             raise CaperError(f"{where}: closed is 'low', 'high' or None, got {self.closed!r}")
-        for equivalence in self.equivalences:
-            turn = np.array(equivalence.turn, float)
-            if sorted(equivalence.permutation) != list(range(len(self.parts))):
+        for symmetry in self.symmetries:
+            turn = np.array(symmetry.turn, float)
+            if sorted(symmetry.permutation) != list(range(len(self.parts))):
                 raise CaperError(
-                    f"{where}: an equivalence must permute the parts, got {equivalence.permutation}"
+                    f"{where}: an symmetry must permute the parts, got {symmetry.permutation}"
                 )
             is_rotation = turn.shape == (3, 3) and np.allclose(turn @ turn.T, np.eye(3), atol=1e-5)
             if not is_rotation or np.linalg.det(turn) < 0:
-                raise CaperError(f"{where}: the turn of an equivalence is not a rotation: {turn}")
+                raise CaperError(f"{where}: the turn of an symmetry is not a rotation: {turn}")

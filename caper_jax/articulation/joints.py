@@ -1,6 +1,6 @@
 """Transforms of joints (paper Sec 5.2.2; Eq 8 in its right form, ``[R | (I - R) q]``).
 
-A state is measured from the rest pose, in radians (revolute) or metres (prismatic). A positive one
+A state is measured from the rest pose, in radians (revolute) or meters (prismatic). A positive one
 turns the child by plus the state about the axis, or slides it by plus the state along the axis.
 Axes are scaled to unit length here; a zero axis gives the identity, with finite derivatives.
 """
@@ -15,8 +15,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from caper_jax.errors import unknown_name
-from caper_jax.geometry import se3, so3
-from caper_jax.geometry.linalg import as_floating, cross, unit
+from caper_jax.lie import se3, so3
+from caper_jax.lie.linalg import as_floating, cross, unit
 
 
 def revolute_transform(axis: ArrayLike, pivot: ArrayLike, angle: ArrayLike) -> jax.Array:
@@ -26,7 +26,7 @@ def revolute_transform(axis: ArrayLike, pivot: ArrayLike, angle: ArrayLike) -> j
 
     Args:
       axis: [..., 3] direction of the line.
-      pivot: [..., 3] metres; any point of the line.
+      pivot: [..., 3] meters; any point of the line.
       angle: [...] radians.
     """
     return joint_transform("revolute", axis, pivot, angle)
@@ -37,7 +37,7 @@ def prismatic_transform(axis: ArrayLike, displacement: ArrayLike) -> jax.Array:
 
     Args:
       axis: [..., 3] direction.
-      displacement: [...] metres.
+      displacement: [...] meters.
     """
     u = unit(as_floating(axis, (3,), "axis"))
     shift = u * as_floating(displacement, (), "displacement")[..., None]
@@ -52,8 +52,8 @@ def joint_transform(
     Args:
       joint_type: "revolute" or "prismatic".
       axis: [..., 3] in the root's canonical (rest) frame.
-      pivot: [..., 3] metres, same frame; without effect on a prismatic joint.
-      state: [...] radians or metres.
+      pivot: [..., 3] meters, same frame; without effect on a prismatic joint.
+      state: [...] radians or meters.
 
     Raises:
       CaperError: unknown joint type.
@@ -72,8 +72,8 @@ def joint_transforms(
     Args:
       joint_types: J times "revolute" or "prismatic".
       axis: [..., J, 3] in the root's canonical (rest) frame.
-      pivot: [..., J, 3] metres, same frame; without effect on a prismatic joint.
-      state: [..., J] radians or metres.
+      pivot: [..., J, 3] meters, same frame; without effect on a prismatic joint.
+      state: [..., J] radians or meters.
 
     Raises:
       CaperError: unknown joint type.

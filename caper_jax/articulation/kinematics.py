@@ -10,8 +10,8 @@ from jax.typing import ArrayLike
 
 from caper_jax.articulation.joints import joint_transforms
 from caper_jax.errors import CaperError
-from caper_jax.geometry import se3
-from caper_jax.geometry.linalg import as_floating
+from caper_jax.lie import se3
+from caper_jax.lie.linalg import as_floating
 
 
 def forward_kinematics(
@@ -30,8 +30,8 @@ def forward_kinematics(
     Args:
       root: [..., 4, 4] pose of part 0, canonical frame -> camera.
       axis: [..., J, 3] unit joint axes.
-      pivot: [..., J, 3] metres; points on the axes.
-      state: [..., J] radians (revolute) or metres (prismatic) from the rest pose.
+      pivot: [..., J, 3] meters; points on the axes.
+      state: [..., J] radians (revolute) or meters (prismatic) from the rest pose.
       joint_types: J times "revolute" or "prismatic"; joint j carries part j + 1.
       parents: J parent parts; a parent comes before its child.
 

@@ -16,13 +16,13 @@ class ArticulatedPose:
 
     Attributes:
       rotation: [..., K, 3, 3] rest-canonical part frame -> camera.
-      translation: [..., K, 3] metres; ``p_cam = R p + t``.
-      size: [..., K, 3] metres; full extents of the part's box in its rest-canonical frame.
-      box_center: [..., K, 3] metres; centre of that box, in the rest-canonical frame.
+      translation: [..., K, 3] meters; ``p_cam = R p + t``.
+      size: [..., K, 3] meters; full extents of the part's box in its rest-canonical frame.
+      box_center: [..., K, 3] meters; center of that box, in the rest-canonical frame.
       joint_axis: [..., J, 3] unit vectors in the root's canonical frame; a positive state turns
         (or moves) the child by plus the state about (along) it.
-      joint_pivot: [..., J, 3] metres; a point on the axis, root's canonical frame.
-      joint_state: [..., J] radians (revolute) or metres (prismatic) from the rest pose.
+      joint_pivot: [..., J, 3] meters; a point on the axis, root's canonical frame.
+      joint_state: [..., J] radians (revolute) or meters (prismatic) from the rest pose.
     """
 
     rotation: Array

@@ -2,7 +2,8 @@
 
 A category of your own needs no change to this package. Write a module that defines a ``Category``;
 tests/microwave.py in the repository is a whole one. From Python, pass the object itself to
-``Generator``, ``Task`` or ``Estimator``, or ``register`` it once and use its name like any other.
+``Generator``, ``Objective`` or ``Estimator``, or ``register`` it once and use its name like any
+other.
 On the command line, spell it ``FILE.py:NAME`` or ``package.module:NAME``::
 
     caper generate --category microwave.py:MICROWAVE --frames 3 --images --out frames
@@ -15,13 +16,13 @@ What a definition settles:
 
 * ``parts`` and ``joints``: the root first, every part after its parent; joint j carries part j + 1.
 * ``shape``: a function from a numpy generator to an ``ObjectModel``: solids per part in one common
-  frame, metres, y up (or ``viewpoint.up``), in the pose that is called rest, where every state is
+  frame, meters, y up (or ``viewpoint.up``), in the pose that is called rest, where every state is
   0; joint axes, pivots and limits in the same frame. A positive state opens.
 * ``directions``: the two axes of the root's frame that its shape shows best.
-* ``viewpoint`` and ``equivalences``: where cameras stand, and which readings are equally right.
-* ``unit``, network units per metre: 2 over the mean diagonal of the whole object.
+* ``viewpoint`` and ``symmetries``: where cameras stand, and which readings are equally right.
+* ``unit``, network units per meter: 2 over the mean diagonal of the whole object.
 * ``mean_size`` and ``mean_center``: the means of ``size`` and ``box_center`` of
-  ``build_bank(draw_models(category, 1500, "train", 0))``.
+  ``build_bank(draw_instances(category, 1500, "train", 0))``.
 """
 
 from __future__ import annotations

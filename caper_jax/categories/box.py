@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from caper_jax.articulation.category import Category, Equivalence, Joint, ObjectModel
+from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry
 from caper_jax.categories.forms import about
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid, frustum
 
@@ -169,7 +169,7 @@ def _chest(rng: np.random.Generator) -> ObjectModel:
 
 
 def _tray(size, wall: float, floor: float, upside_down: bool, center=(0.0, 0.0, 0.0)) -> Solid:
-    """An open box: full extents ``size``, walls and floor in metres."""
+    """An open box: full extents ``size``, walls and floor in meters."""
     length, height, depth = size
     sign = -1.0 if upside_down else 1.0
     cavity = np.asarray(center, float) + (0, sign * floor, 0)
@@ -180,7 +180,7 @@ def _tray(size, wall: float, floor: float, upside_down: bool, center=(0.0, 0.0, 
 def _soft_tray(
     center, size, edge: float, wall: float, floor: float, upside_down: bool
 ) -> list[Solid]:
-    """A tray whose front and sides bulge by ``edge`` metres, flat at the back."""
+    """A tray whose front and sides bulge by ``edge`` meters, flat at the back."""
     length, height, depth = size
     middle = np.asarray(center, float)
     inner = (length - 2 * edge, height, depth - edge)
@@ -196,7 +196,7 @@ def _soft_tray(
 
 
 def _slope(rng: np.random.Generator, size) -> float:
-    """How far, in metres, the walls of a tapered tray come in towards its bottom."""
+    """How far, in meters, the walls of a tapered tray come in towards its bottom."""
     length, height, depth = size
     return min(rng.uniform(0.03, 0.15) * height, 0.12 * min(length, depth))
 
@@ -218,7 +218,7 @@ def _lid_shell(rng: np.random.Generator, center, size, wall: float) -> Solid:
 
 
 def _contents(rng: np.random.Generator, size, wall: float, floor: float, top: float) -> list[Solid]:
-    """Dividers, pens and blocks in the tray, below ``top`` (y, metres)."""
+    """Dividers, pens and blocks in the tray, below ``top`` (y, meters)."""
     length, height, depth = size
     bottom = -height / 2 + floor
     room = min(top, height / 2) - bottom
@@ -282,8 +282,8 @@ BOX = Category(
     mean_size=((0.227, 0.062, 0.116), (0.224, 0.022, 0.117)),
     mean_center=((0.0, -0.007, -0.003), (0.0, 0.026, 0.002)),
     shape=shape,
-    equivalences=(
-        Equivalence(
+    symmetries=(
+        Symmetry(
             permutation=(1, 0),
             turn=((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
             reason="a case whose lid is as deep as its base may exchange the two",

@@ -9,7 +9,7 @@ import numpy as np
 from caper_jax.categories.furniture import TURN_X, TURN_Y, Handle, StandStyle
 from caper_jax.geometry.solids import Solid, box, cylinder, frustum
 
-# Probability, and ranges of width, height (without stand) and depth in metres.
+# Probability, and ranges of width, height (without stand) and depth in meters.
 TYPES = {
     "chest": (0.24, (0.6, 1.4), (0.55, 1.15), (0.38, 0.58)),
     "tall": (0.2, (0.32, 0.55), (0.6, 1.25), (0.38, 0.62)),
@@ -41,7 +41,7 @@ _LIFT = {
 
 @dataclass(frozen=True)
 class Plan:
-    """Measures of a cabinet in metres; x centred, floor at y = 0, carcass front at z = 0.
+    """Measures of a cabinet in meters; x centered, floor at y = 0, carcass front at z = 0.
 
     Attributes:
       width, height, depth: outer extents of the carcass.

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-LONGEST = 0.115  # metres of extension that any instance allows
+LONGEST = 0.115  # meters of extension that any instance allows
 SHARE = 0.9  # of the slider's way that is used
 
-# Probability; length, width and height of the handle and width of the blade, metres. "wide" and
+# Probability; length, width and height of the handle and width of the blade, meters. "wide" and
 # "slim" are those of the nine ReArt-48 cutters: handle 105-163 x 22-34 x 11-20 mm, blade with
 # carrier 78-134 x 12-22 mm, 71-97 mm of travel, slider up to 5 mm above the face.
 TYPES = {
@@ -23,7 +23,7 @@ TYPES = {
 
 @dataclass(frozen=True)
 class Plan:
-    """Measures in metres; the handle spans x in [0, length] and y in [-height / 2, height / 2].
+    """Measures in meters; the handle spans x in [0, length] and y in [-height / 2, height / 2].
 
     Attributes:
       length, width, height: of the handle.

@@ -1,6 +1,6 @@
 """Dishwashers without their door: measures and body.
 
-Measured with the door shut: floor at y = 0, opening at z = 0, x centred.
+Measured with the door shut: floor at y = 0, opening at z = 0, x centered.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ import numpy as np
 from caper_jax.categories.furniture import TURN_X, stand
 from caper_jax.geometry.solids import Solid, box, cylinder
 
-# Probability, and ranges of width, height (without worktop) and depth in metres.
+# Probability, and ranges of width, height (without worktop) and depth in meters.
 TYPES = {
     "standard": (0.4, (0.56, 0.64), (0.78, 0.9), (0.5, 0.66)),
     "slim": (0.2, (0.42, 0.48), (0.78, 0.88), (0.48, 0.64)),
     "built_in": (0.25, (0.44, 0.62), (0.7, 0.9), (0.48, 0.62)),
     "table_top": (0.15, (0.4, 0.6), (0.38, 0.5), (0.4, 0.55)),
 }
-_GAP = 0.004  # between the door and what is around it, metres
+_GAP = 0.004  # between the door and what is around it, meters
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Measures in metres, door shut; x centred.
+    """Measures in meters, door shut; x centered.
 
     Attributes:
       width, height, depth: outer extents; the height counts from the floor.

@@ -17,8 +17,8 @@ def inside(
     """Solids in a tub.
 
     Args:
-      cavity: its low and high corner [3], metres; open at z = 0.
-      plug: how far the shut door reaches into it, metres.
+      cavity: its low and high corner [3], meters; open at z = 0.
+      plug: how far the shut door reaches into it, meters.
       small: only one or two racks.
     """
     low, high = cavity
@@ -72,7 +72,7 @@ class _Rack:
 
     Attributes:
       solids: all of it.
-      floor: y of what things stand on, metres.
+      floor: y of what things stand on, meters.
       places: x of where they can stand.
       half_x: half its width inside.
       ends: z of its back and front.

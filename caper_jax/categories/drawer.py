@@ -20,14 +20,14 @@ class _Style:
     Attributes:
       relief: of the fronts: "plain", "bevel", "panel" (raised), "shaker" (sunk), "bow", "grip" (a
         recess at the upper edge) or "notch" (an opening there).
-      rim: width of the frame about a panel, metres.
-      depth: of the relief, metres.
+      rim: width of the frame about a panel, meters.
+      depth: of the relief, meters.
       handle, handle_height: the handle, and where: 0 is the lower edge of a front, 1 the upper.
       grip: half width of a grip, as a share of the front's width.
-      clearance: beside a tray, metres.
+      clearance: beside a tray, meters.
       tray_height: share of the opening.
       tray_depth: share of the room behind the front.
-      walls: thickness of a tray's walls and floor, metres.
+      walls: thickness of a tray's walls and floor, meters.
       rails: low metal trays with a rail above each side.
       full: how likely a drawer holds something.
     """

@@ -20,7 +20,7 @@ _FOLDED = np.radians(90.0)
 
 @dataclass(frozen=True)
 class _Line:
-    """What both temples share; lengths in metres, angles in radians.
+    """What both temples share; lengths in meters, angles in radians.
 
     Attributes:
       slope: downwards, of the straight piece.

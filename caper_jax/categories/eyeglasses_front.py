@@ -17,7 +17,7 @@ _Y = np.array([0.0, 1.0, 0.0])
 
 @dataclass(frozen=True)
 class Front:
-    """What all pieces of a frame's front share, metres; right means +x.
+    """What all pieces of a frame's front share, meters; right means +x.
 
     Attributes:
       scale: of a head, 1 for a grown-up's.

@@ -60,7 +60,7 @@ def mirrored(solid: Solid, axis: Axis) -> Solid:
 
 
 def beam(start, end, half, up, taper=None, round_: bool = False) -> Solid:
-    """A solid from ``start`` to ``end`` [3], with half width and half height ``half``, metres.
+    """A solid from ``start`` to ``end`` [3], with half width and half height ``half``, meters.
 
     Args:
       start, end: the middles of its two ends.

@@ -1,4 +1,4 @@
-"""Handles on fronts that face +z, and what furniture stands on; metres, y up."""
+"""Handles on fronts that face +z, and what furniture stands on; meters, y up."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def stand(
     Args:
       style: "floor" is nothing at all (then height is 0), "plinth" a block set back from the
         front, "runners" two skids from front to back, "sides" the side panels drawn down.
-      size: (width, height, depth); x is centred, the front is at z = 0.
+      size: (width, height, depth); x is centered, the front is at z = 0.
     """
     width, height, depth = size
     if style == "floor":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from caper_jax.articulation.category import Category, Equivalence, Joint, ObjectModel
+from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry
 from caper_jax.categories.forms import about
 from caper_jax.geometry.solids import Solid, box, cylinder, frustum
 
@@ -164,8 +164,8 @@ LAPTOP = Category(
     mean_size=((0.331, 0.029, 0.236), (0.326, 0.227, 0.008)),
     mean_center=((0.0, -0.11, 0.001), (0.0, 0.012, -0.112)),
     shape=shape,
-    equivalences=(
-        Equivalence(
+    symmetries=(
+        Symmetry(
             permutation=(1, 0),
             turn=((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
             reason="without a visible keyboard, base and lid are two like plates",

@@ -41,7 +41,7 @@ class _Style:
     """How the links of one arm look.
 
     Attributes:
-      radius: [7] half thickness of each link, metres.
+      radius: [7] half thickness of each link, meters.
       boxy: links 1 to 3 are cast boxes rather than tubes.
       taper: thickness of the end of a long tube over that of its start.
       slim: thickness of long tubes over that of joints.
@@ -119,7 +119,7 @@ def _tube(start, end, thick: float, taper: float, boxy: bool) -> Solid:
 
 
 def _joint(place, axis: str, radius: float, style: _Style, child: bool) -> Solid:
-    """One link's half of a joint that crosses the link: about ``axis``, centred at ``place``."""
+    """One link's half of a joint that crosses the link: about ``axis``, centered at ``place``."""
     radius = style.bulge * radius
     width, rotation = style.width * radius, _ALONG[axis]
     if axis != "x" or style.joint == "split":

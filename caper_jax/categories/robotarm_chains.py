@@ -28,12 +28,12 @@ class Chain:
     """A serial chain of seven links in its rest pose, standing on the floor (y = 0) at the origin.
 
     Attributes:
-      paths: of each link [n, 3] points, metres: path k begins on joint k (path 0 on the floor) and
+      paths: of each link [n, 3] points, meters: path k begins on joint k (path 0 on the floor) and
         ends where joint k + 1 is.
       axes: of the six joints, the letter of the positive canonical axis each turns about at rest.
       limits: [6, 2] degrees from the rest pose.
       tip: [3] unit direction that the flange faces.
-      radius: half the thickness of the lowest link, metres.
+      radius: half the thickness of the lowest link, meters.
     """
 
     paths: tuple[np.ndarray, ...]

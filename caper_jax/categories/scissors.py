@@ -4,7 +4,7 @@ The frame and the root follow from the object itself:
 
 * x halves the angle between the blades; a blade's line runs from the pivot to its tip.
 * The root is the blade whose handle reaches farther back (for more fingers, or with a finger
-  rest). Of equal halves either is: a half turn about x exchanges them (the declared equivalence).
+  rest). Of equal halves either is: a half turn about x exchanges them (the declared symmetry).
 * y points to where the root's tip lies to the right (+z) of x. So the root's tip is at +z, its
   handle (unless bent) at -z, and right-handed scissors have the root on top (+y).
 * A positive state turns the other blade about +y: its tip goes to -z, the scissors open. The
@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from caper_jax.articulation.category import Category, Equivalence, Joint, ObjectModel, Viewpoint
+from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry, Viewpoint
 from caper_jax.categories.forms import about, mirrored, turned
 from caper_jax.categories.scissors_half import Half, blade_solids, handle_solids
 
@@ -220,8 +220,8 @@ SCISSORS = Category(
     mean_center=((0.0, 0.0, -0.016), (0.006, 0.0, 0.014)),
     shape=shape,
     viewpoint=Viewpoint(either_side=True),
-    equivalences=(
-        Equivalence(
+    symmetries=(
+        Symmetry(
             permutation=(1, 0),
             turn=((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
             reason="equal halves change places by a half turn about x",

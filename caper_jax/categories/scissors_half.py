@@ -15,7 +15,7 @@ _FLAT = about("x", -np.pi / 2)  # cylinder z -> y
 
 @dataclass(frozen=True)
 class Half:
-    """One blade with its handle, closed: tip at +x, handle at -x and -z; lengths in metres.
+    """One blade with its handle, closed: tip at +x, handle at -x and -z; lengths in meters.
 
     Attributes:
       blade: from the pivot to the tip.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Probability, length and width of the base in metres, scale of the thicknesses. "half" are those
+# Probability, length and width of the base in meters, scale of the thicknesses. "half" are those
 # of the seven ReArt-48 staplers: base 120-162 x 34-42 mm and 28-35 high with the hinge's cheeks,
 # hinge 2-10 mm inside the back and 23-29 mm above the underside, arm 27-32 mm wide.
 TYPES = {
@@ -21,7 +21,7 @@ TYPES = {
 
 @dataclass(frozen=True)
 class Plan:
-    """Measures in metres; the underside of the base is y = 0, the hinge z = 0, x is centred.
+    """Measures in meters; the underside of the base is y = 0, the hinge z = 0, x is centered.
 
     Attributes:
       scale: of thicknesses and small parts, 1 for an office stapler.

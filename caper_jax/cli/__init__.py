@@ -14,15 +14,14 @@ from caper_jax.errors import unknown_name
 COMMANDS = {
     "demo": "estimate poses on the depth frames that ship with the package",
     "estimate": "estimate poses from your own depth image or point cloud",
-    "generate": "write synthetic labelled data",
+    "generate": "write synthetic labeled data",
     "train": "train a category's networks, or resume a run",
     "calibrate": "calibrate what a model says about its own errors",
     "export": "write a model that runs without this package",
     "track": "track an object through videos or a live stream",
-    "evaluate": "measure a model on labelled data",
-    "validate": "check labelled data and list what is wrong with it",
+    "evaluate": "measure a model on labeled data",
+    "validate": "check labeled data and list what is wrong with it",
     "gallery": "draw the generated shapes of the categories",
-    "benchmark": "measure speed on this machine",
     "reproduce": "measure the tables of the paper again",
 }
 

@@ -49,19 +49,20 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
+    from caper_jax.config import TRAINING_DATA
     from caper_jax.estimator import load
-    from caper_jax.model_files import CARD_FILE, write_card
-    from caper_jax.training.calibration import FRAMES, calibrate, check_frames
-    from caper_jax.training.run import TRAINING_DATA
+    from caper_jax.models.files import CARD_FILE, write_card
+    from caper_jax.training.fit_uncertainty import FRAMES, calibrate, check_frame_count
 
     frames = arguments.frames or FRAMES
-    check_frames(frames)  # before anything is written
+    check_frame_count(frames)  # before anything is written
     if arguments.sides:
-        from caper_jax.training import sides
+        from caper_jax.config import RefinerConfig
+        from caper_jax.training import fit_refiner
 
-        number = sides.FRAMES if arguments.sides is True else arguments.sides
+        number = RefinerConfig().frames if arguments.sides is True else arguments.sides
         options = {"frames": number, "seed": arguments.seed}
-        sides.add_sides(arguments.weights, arguments.category, TRAINING_DATA, **options)
+        fit_refiner.add_sides(arguments.weights, arguments.category, TRAINING_DATA, **options)
     estimator = load(arguments.category, arguments.weights)
     section = calibrate(estimator, TRAINING_DATA, frames, arguments.seed)
     write_card(arguments.weights, {**estimator.card, "calibration": section})

@@ -95,7 +95,7 @@ def create_parser(
 
 
 def add_splits(parser: argparse.ArgumentParser) -> None:
-    """The options of commands that read a labelled dataset."""
+    """The options of commands that read a labeled dataset."""
     parser.add_argument("--split", help="split to read (default: all there is)")
     parser.add_argument(
         "--official-split",
@@ -150,7 +150,7 @@ OBJECT_SCALE: dict[str, Any] = {
     "default": 1.0,
     "metavar": "S",
     "help": "the objects are S times as large as those the model was trained on, e.g. 3.7 for the "
-    "laptops of PM-Videos and ArtImage (PartNet units read as metres)",
+    "laptops of PM-Videos and ArtImage (PartNet units read as meters)",
 }
 
 

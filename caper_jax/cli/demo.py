@@ -101,7 +101,7 @@ def _find_frames(category: str) -> dict[str, list[Path]]:
 
 def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
     """Estimates the frames one by one, as a live camera would, and prints what it finds."""
-    from caper_jax.data.cloud import cloud_from_depth
+    from caper_jax.data.clouds import cloud_from_depth
     from caper_jax.data.images import read_depth, read_intrinsics, read_mask
     from caper_jax.progress import progress
     from caper_jax.visualization.scene import Scene
@@ -153,14 +153,14 @@ def _timed(
 
 
 def _read_truth(path: Path, category: Category) -> ArticulatedPose:
-    """Ground truth under the names of ``ArticulatedPose``; states in degrees or metres.
+    """Ground truth under the names of ``ArticulatedPose``; states in degrees or meters.
 
     Raises:
       CaperError: missing or broken file, or numbers that are no pose of this category.
     """
     from caper_jax.articulation.pose import ArticulatedPose
     from caper_jax.data.images import read_json
-    from caper_jax.data.schema import pose_problems, pose_shapes
+    from caper_jax.data.types import pose_problems, pose_shapes
 
     content = read_json(path)
     try:

@@ -19,7 +19,7 @@ from caper_jax.errors import CaperError
 if TYPE_CHECKING:
     from caper_jax.articulation.category import Category
     from caper_jax.articulation.pose import ArticulatedPose
-    from caper_jax.data.cloud import Cloud
+    from caper_jax.data.clouds import Cloud
     from caper_jax.estimator import Prediction
     from caper_jax.visualization.scene import Scene
 
@@ -53,10 +53,10 @@ def build_parser() -> argparse.ArgumentParser:
     )
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument(
-        "--depth", type=Path, help="16-bit PNG in millimetres, or float .npy [H, W] in metres"
+        "--depth", type=Path, help="16-bit PNG in millimeters, or float .npy [H, W] in meters"
     )
     source.add_argument(
-        "--points", type=Path, help="cloud of the object alone: .npy [N, 3] or .ply, metres"
+        "--points", type=Path, help="cloud of the object alone: .npy [N, 3] or .ply, meters"
     )
     region = parser.add_mutually_exclusive_group()
     region.add_argument("--mask", type=Path, help="image of the same size, not black on the object")
@@ -67,7 +67,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--intrinsics", type=Path, help="camera as JSON: fx, fy, cx, cy, or K, or Open3D pinhole"
     )
     parser.add_argument(
-        "--depth-scale", type=common.positive_float, help="metres per unit of the depth image"
+        "--depth-scale", type=common.positive_float, help="meters per unit of the depth image"
     )
     parser.add_argument("--json", type=Path, help="file to write the pose to")
     parser.add_argument("--picture", type=Path, help="PNG to draw the pose in")
@@ -144,7 +144,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
 
 
 def _observe(arguments: argparse.Namespace) -> _Observation:
-    from caper_jax.data.cloud import cloud_from_depth, read_points, sample_points
+    from caper_jax.data.clouds import cloud_from_depth, read_points, sample_points
 
     if arguments.points is not None:
         for option in ("mask", "box", "intrinsics", "depth_scale"):
@@ -175,12 +175,12 @@ def _state(pose: ArticulatedPose, category: Category, joint: int) -> tuple[float
     value = float(pose.joint_state[joint])
     if category.joint_types[joint] == "revolute":
         return float(np.degrees(value)), "degrees"
-    return value, "metres"
+    return value, "meters"
 
 
 def _certainty(prediction: Prediction, category: Category) -> str:
     """Lines on how sure the model is, and on parts that are known through their joints alone."""
-    from caper_jax.confidence import HIDDEN_POINTS
+    from caper_jax.models.uncertainty import HIDDEN_POINTS
     from caper_jax.visualization.scene import format_state, joint_name
 
     axes = zip(category.directions, prediction.confidence, strict=True)
@@ -201,8 +201,8 @@ def _certainty(prediction: Prediction, category: Category) -> str:
 
 
 def _as_json(prediction: Prediction, category: Category, cloud: Cloud) -> dict[str, Any]:
-    """The pose under the names of ``ArticulatedPose``; joint states in degrees or metres."""
-    from caper_jax.confidence import HIDDEN_POINTS
+    """The pose under the names of ``ArticulatedPose``; joint states in degrees or meters."""
+    from caper_jax.models.uncertainty import HIDDEN_POINTS
 
     pose = prediction.pose
     states = [_state(pose, category, j) for j in range(category.num_joints)]
@@ -213,7 +213,7 @@ def _as_json(prediction: Prediction, category: Category, cloud: Cloud) -> dict[s
         "parts": list(category.parts),
         "joint_types": list(category.joint_types),
         "frame": FRAME,
-        "units": {"length": "metres", "joint_state": [unit for _, unit in states]},
+        "units": {"length": "meters", "joint_state": [unit for _, unit in states]},
         "pose": values,
         "confidence": prediction.confidence.tolist(),
         "points": {

@@ -1,4 +1,4 @@
-"""``caper evaluate``: measures a model on labelled data."""
+"""``caper evaluate``: measures a model on labeled data."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from caper_jax.cli import common
-from caper_jax.data import FORMATS
+from caper_jax.data.readers import FORMATS
 from caper_jax.errors import CaperError
 
 if TYPE_CHECKING:
-    from caper_jax.data.schema import Dataset
+    from caper_jax.data.types import Dataset
     from caper_jax.estimator import Estimator
     from caper_jax.evaluation.protocol import Evaluation
 
@@ -24,7 +24,7 @@ PREDICTORS = ("model", "truth", "mean")
 def build_parser() -> argparse.ArgumentParser:
     parser = common.create_parser(
         "evaluate",
-        "Estimates every frame of a labelled dataset and writes to a folder: metrics.json (mean\n"
+        "Estimates every frame of a labeled dataset and writes to a folder: metrics.json (mean\n"
         "and median of every error, failed frames included) and predictions.npz (every estimate).",
         [
             ("--category box --data ReArtMix --format reartmix --out outputs/box", "real frames"),
@@ -73,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
     from caper_jax import categories
-    from caper_jax.data import open_dataset
+    from caper_jax.data.readers import open_dataset
     from caper_jax.evaluation import protocol, report
 
     category = categories.get(arguments.category)
@@ -104,7 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise CaperError(f"model {weights}: its card has no mean_pose; choose another model")
 
     evaluation = protocol.evaluate(dataset, predictor, arguments.limit)
-    result = report.summarise(evaluation, dataset, arguments.predictor, weights)
+    result = report.summarize(evaluation, dataset, arguments.predictor, weights)
     arguments.out.mkdir(parents=True, exist_ok=True)
     report.write_report(arguments.out, evaluation, result)
     print(report.format_report(result))
@@ -128,7 +128,7 @@ def _write_worst(
     import numpy as np
 
     from caper_jax.evaluation.protocol import NUM_POINTS, cloud_of
-    from caper_jax.geometry import so3
+    from caper_jax.lie import so3
     from caper_jax.visualization.picture import write_picture
     from caper_jax.visualization.scene import Scene
 

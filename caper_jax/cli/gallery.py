@@ -13,7 +13,7 @@ from caper_jax.cli import common
 def build_parser() -> argparse.ArgumentParser:
     parser = common.create_parser(
         "gallery",
-        "Draws generated instances, parts coloured, in random states before random cameras: one\n"
+        "Draws generated instances, parts colored, in random states before random cameras: one\n"
         "row per category. Look at it before you train on shapes of your own.",
         [
             ("--out gallery.png", "all categories"),

@@ -1,4 +1,4 @@
-"""``caper generate``: writes synthetic labelled data to a file."""
+"""``caper generate``: writes synthetic labeled data to a file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from caper_jax.errors import CaperError, unknown_name
 
 if TYPE_CHECKING:
     from caper_jax.articulation.category import Category
-    from caper_jax.data.synthetic.config import GeneratorConfig
+    from caper_jax.config import GeneratorConfig
 
 DEFAULTS = {"frames": 1000, "instances": 100, "points": 4096, "grid": 128}
 VIDEO_BATCH = 4
@@ -28,7 +28,7 @@ _UNUSED = {
 def build_parser() -> argparse.ArgumentParser:
     parser = common.create_parser(
         "generate",
-        "Draws labelled frames of a category from its procedural shapes and writes them to one\n"
+        "Draws labeled frames of a category from its procedural shapes and writes them to one\n"
         "HDF5 file: single frames, or videos of one object each whose joints move. Splits never\n"
         "share an instance; the same arguments give the same frames.",
         [
@@ -136,8 +136,8 @@ def _check_options(arguments: argparse.Namespace) -> None:
     Raises:
       CaperError: names them.
     """
-    from caper_jax.data.synthetic.config import LEAST
-    from caper_jax.data.synthetic.sensor import PRESETS
+    LEAST = {"grid": 8, "points": 16}
+    from caper_jax.synthetic.sensor import PRESETS
 
     if arguments.videos:
         for option in ("frames", "images"):
@@ -151,10 +151,10 @@ def _check_options(arguments: argparse.Namespace) -> None:
         for option in unused:
             if getattr(arguments, kind) and getattr(arguments, option) is not None:
                 raise CaperError(f"--{option} has no effect with --{kind}: leave it out")
-    for option, name in (("points", "num_points"), ("grid", "grid")):
+    for option in LEAST:
         value = getattr(arguments, option)
-        if value is not None and value < LEAST[name]:
-            raise CaperError(f"--{option} must be at least {LEAST[name]}, got {value}")
+        if value is not None and value < LEAST[option]:
+            raise CaperError(f"--{option} must be at least {LEAST[option]}, got {value}")
     if arguments.noise not in PRESETS:
         raise unknown_name("--noise", arguments.noise, PRESETS)
 
@@ -165,13 +165,13 @@ def _write_images(arguments: argparse.Namespace) -> None:
     import numpy as np
 
     from caper_jax import categories
-    from caper_jax.data.synthetic.bank import build_bank, draw_models, split_key
-    from caper_jax.data.synthetic.render import render_image, write_frame
     from caper_jax.progress import progress
+    from caper_jax.synthetic.instances import build_bank, draw_instances, split_key
+    from caper_jax.synthetic.render import render_image, write_frame
 
     category = categories.get(arguments.category)
     common.check_folder(arguments.out, "--out")
-    models = draw_models(category, arguments.frames, arguments.split, arguments.seed)
+    models = draw_instances(category, arguments.frames, arguments.split, arguments.seed)
     bank = build_bank(models)
     key = split_key(arguments.split, arguments.seed)
     with progress("rendering", total=arguments.frames) as bar:
@@ -189,10 +189,10 @@ def _write_images(arguments: argparse.Namespace) -> None:
 
 
 def _write_file(arguments: argparse.Namespace) -> None:
-    """Labelled clouds, one HDF5 file."""
+    """Labeled clouds, one HDF5 file."""
     from caper_jax import __version__, categories
+    from caper_jax.config import GeneratorConfig
     from caper_jax.data import hdf5
-    from caper_jax.data.synthetic.config import GeneratorConfig
 
     category = categories.get(arguments.category)
     hdf5.check_writable(arguments.out, arguments.overwrite)
@@ -228,8 +228,8 @@ def _write_file(arguments: argparse.Namespace) -> None:
 
 def _draw_frames(category: Category, config: GeneratorConfig, arguments: argparse.Namespace):
     """Single frames: what ``hdf5.write`` is to be given, and nothing more to say."""
-    from caper_jax.data.synthetic.collect import collect_frames
-    from caper_jax.data.synthetic.scene import Generator
+    from caper_jax.synthetic.collect import collect_frames
+    from caper_jax.synthetic.frames import Generator
 
     generator = Generator(category, config, arguments.split, arguments.seed)
     return collect_frames(generator, arguments.seed, arguments.frames), {}
@@ -237,9 +237,9 @@ def _draw_frames(category: Category, config: GeneratorConfig, arguments: argpars
 
 def _draw_videos(category: Category, config: GeneratorConfig, arguments: argparse.Namespace):
     """Videos one after the other: what ``hdf5.write`` is to be given, and the mode."""
-    from caper_jax.data.synthetic.collect import collect_videos
-    from caper_jax.data.synthetic.videos import FRAMES as LENGTH
-    from caper_jax.data.synthetic.videos import VideoGenerator
+    from caper_jax.synthetic.collect import collect_videos
+    from caper_jax.synthetic.videos import FRAMES as LENGTH
+    from caper_jax.synthetic.videos import VideoGenerator
 
     mode, length = arguments.mode or "paper", arguments.frames_per_video or LENGTH
     generator = VideoGenerator(category, config, mode, length, arguments.split, arguments.seed)

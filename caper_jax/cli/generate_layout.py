@@ -38,12 +38,12 @@ def write_layout(arguments: argparse.Namespace) -> None:
     import numpy as np
 
     from caper_jax import categories
-    from caper_jax.data.artimage_writer import LayoutWriter
-    from caper_jax.data.synthetic.bank import build_bank, draw_models, split_key
-    from caper_jax.data.synthetic.videos import FRAMES as FRAMES_PER_VIDEO
-    from caper_jax.data.synthetic.videos import check_length
-    from caper_jax.data.synthetic.views import clip, still
     from caper_jax.progress import progress
+    from caper_jax.synthetic.artimage_writer import LayoutWriter
+    from caper_jax.synthetic.instances import build_bank, draw_instances, split_key
+    from caper_jax.synthetic.videos import FRAMES as FRAMES_PER_VIDEO
+    from caper_jax.synthetic.videos import check_length
+    from caper_jax.synthetic.views import clip, still
 
     videos = arguments.layout == "pm-videos"
     if videos and not arguments.videos:
@@ -59,7 +59,7 @@ def write_layout(arguments: argparse.Namespace) -> None:
     common.check_folder(arguments.out, "--out")
     count = arguments.videos if videos else arguments.frames
     instances = min(arguments.instances, count)
-    models = draw_models(category, instances, arguments.split, arguments.seed)
+    models = draw_instances(category, instances, arguments.split, arguments.seed)
     bank = build_bank(models)
     intrinsics = np.array([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
     writer = LayoutWriter(arguments.out, category, arguments.split, intrinsics, (SIZE, SIZE))

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--rest",
         type=_states,
-        help="states of the file's joints at rest, degrees or metres: one number, or "
+        help="states of the file's joints at rest, degrees or meters: one number, or "
         "JOINT=NUMBER,... (a link's name stands for the joint that carries it)",
     )
     group.add_argument(
@@ -122,8 +122,8 @@ def write_urdf_frames(arguments: argparse.Namespace) -> None:
     from caper_jax import __version__, categories
     from caper_jax.data import hdf5
     from caper_jax.data.urdf.canonical import ImportOptions
-    from caper_jax.data.urdf.render import render_frames
     from caper_jax.progress import progress
+    from caper_jax.synthetic.urdf_frames import render_frames
     from caper_jax.visualization.model_check import write_model_check
 
     category = categories.get(arguments.category)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from caper_jax.cli import common
-from caper_jax.data.cloud import cloud_from_depth
+from caper_jax.data.clouds import cloud_from_depth
 from caper_jax.data.live import pack_frame
 from caper_jax.data.plane import mask_from_box
 from caper_jax.errors import CaperError
@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def object_points(
     depth: np.ndarray, intrinsics: np.ndarray, box: tuple[float, float, float, float]
 ) -> np.ndarray:
-    """[N, 3] metres of what stands on the table inside the box; none where nothing does."""
+    """[N, 3] meters of what stands on the table inside the box; none where nothing does."""
     try:
         mask = mask_from_box(depth, intrinsics, box)
         return cloud_from_depth(depth, mask, intrinsics, NUM_POINTS).points
@@ -79,7 +79,7 @@ def object_points(
 
 
 def camera_frames(width: int, height: int, rate: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Depth images [H, W] in metres and intrinsics [3, 3] of the first camera found, endlessly.
+    """Depth images [H, W] in meters and intrinsics [3, 3] of the first camera found, endlessly.
 
     Raises:
       CaperError: pyrealsense2 is not installed, or no camera gives such images.

@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from caper_jax.cli import benchmark, common
+from caper_jax.cli import common
+from caper_jax.machine import machine as describe_machine
 
 if TYPE_CHECKING:
-    from caper_jax.evaluation.tables.options import Options
-    from caper_jax.evaluation.tables.render import Report
+    from caper_jax.reproduce.options import Options
+    from caper_jax.reproduce.render import Report
 
 _TRACKING = (
     *("category", "videos", "frames", "mode", "data", "format", "split", "weights", "seed"),
@@ -36,7 +37,7 @@ class Reproduction:
     """One subcommand.
 
     Attributes:
-      module: of ``caper_jax.evaluation.tables``, with ``run(name, options) -> Report``; imported
+      module: of ``caper_jax.reproduce``, with ``run(name, options) -> Report``; imported
         only when it runs.
       summary: one line for --help.
       options: those of ``OPTIONS`` that it takes, besides --out.
@@ -229,15 +230,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     arguments = vars(build_parser().parse_args(sys.argv[1:] if argv is None else argv))
     name = arguments.pop("reproduction")
-    from caper_jax.evaluation.tables.options import Options
-    from caper_jax.evaluation.tables.render import markdown, write_report
+    from caper_jax.reproduce.options import Options
+    from caper_jax.reproduce.render import markdown, write_report
 
     values: dict[str, Any] = {
         key: tuple(v) if isinstance(v, list) else v for key, v in arguments.items()
     }
     options = Options(**values)
     common.check_folder(options.out, "--out")
-    module = importlib.import_module(f"caper_jax.evaluation.tables.{REPRODUCTIONS[name].module}")
+    module = importlib.import_module(f"caper_jax.reproduce.{REPRODUCTIONS[name].module}")
     report = _with_machine(module.run(name, options))
     options.out.mkdir(parents=True, exist_ok=True)
     written = [*write_report(options.out, name, report), *_write_curves(options, name, report)]
@@ -248,7 +249,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _with_machine(report: Report) -> Report:
     """The report with the machine that its times were measured on."""
-    machine = benchmark.machine()
+    machine = describe_machine()
     fact = "machine: " + ", ".join(f"{name} {value}" for name, value in machine.items())
     result = {**report.result, "machine": machine}
     return replace(report, facts=[*report.facts, fact], result=result)
@@ -256,7 +257,7 @@ def _with_machine(report: Report) -> Report:
 
 def _write_curves(options: Options, name: str, report: Report) -> list[Path]:
     """Writes the report's pictures; returns their paths."""
-    from caper_jax.evaluation.tables.render import Curves
+    from caper_jax.reproduce.render import Curves
     from caper_jax.visualization.curves import write_curves, write_scatter
 
     paths = {options.out / f"{name}_{end}.png": curves for end, curves in report.curves.items()}

@@ -18,14 +18,14 @@ _RECORDED = (
 )  # fmt: skip
 _LAYOUTS = """\
 
-a folder of one's own (--format folder) holds depth/*.png (16-bit millimetres),
+a folder of one's own (--format folder) holds depth/*.png (16-bit millimeters),
 mask/*.png of the same names and intrinsics.json (fx, fy, cx, cy), or folders that
 do; a frame without a mask does not show the object.
 
 --live reads frames from standard input (-, every frame) or from HOST:PORT (the
 newest frame, the others are counted) and prints one JSON object per frame. A frame
 is b"CAPR", then version 1, number of points N and a sequence number as little-endian
-uint32, then N x 3 float32: metres, camera frame; see caper_jax/data/live.py. A
+uint32, then N x 3 float32: meters, camera frame; see caper_jax/data/live.py. A
 RealSense camera sends them by (pip install pyrealsense2):
   python -m caper_jax.cli.realsense --box 200,120,440,360 | \\
       caper track --category laptop --live -
@@ -63,7 +63,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--depth-scale",
         type=common.positive_float,
-        help="metres per unit of the depth images of a folder",
+        help="meters per unit of the depth images of a folder",
     )
     parser.add_argument(
         "--video", action="append", metavar="NAME", help="only this video; may be repeated"

@@ -64,7 +64,7 @@ def track_stream(tracker: Tracker, frames: Iterable[LiveFrame]) -> None:
       frames: e.g. from ``open_stream``.
 
     Raises:
-      CaperError: a broken stream, or points that cannot be metres.
+      CaperError: a broken stream, or points that cannot be meters.
     """
     tracker(np.zeros((0, 3), np.float32))  # compiles
     tracker.reset()

@@ -13,20 +13,20 @@ import jax
 import numpy as np
 
 from caper_jax.cli.track import VIDEO_FORMATS
-from caper_jax.configuration import to_dict
-from caper_jax.data import open_dataset
-from caper_jax.data.depth_folder import FORMAT as FOLDER
-from caper_jax.data.depth_folder import DepthFolder, is_depth_folder
-from caper_jax.data.schema import Dataset, Frame
+from caper_jax.config import to_dict
+from caper_jax.data.readers import open_dataset
+from caper_jax.data.readers.depth_folder import FORMAT as FOLDER
+from caper_jax.data.readers.depth_folder import DepthFolder, is_depth_folder
+from caper_jax.data.types import Dataset, Frame
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.estimator import load
 from caper_jax.evaluation.report import METRICS_FILE
 from caper_jax.evaluation.track_report import format_tracks, json_line, track_records
-from caper_jax.evaluation.tracking import Track, summarise_tracks, track_video
+from caper_jax.evaluation.tracking import Track, summarize_tracks, track_video
 from caper_jax.files import write_atomically
 from caper_jax.progress import Progress, progress
 from caper_jax.tracker import Tracker, config_for
-from caper_jax.tracking.step import Tracked
+from caper_jax.tracking.step import TrackResult
 from caper_jax.visualization.scene import Scene
 from caper_jax.visualization.track import Tile, evenly_spaced, write_sheet, write_states
 
@@ -44,7 +44,7 @@ class Recorder(Tracker):
         super().reset(points, rotation, translation, labels)
         self.labels = []
 
-    def __call__(self, points, labels=None) -> Tracked:
+    def __call__(self, points, labels=None) -> TrackResult:
         result = super().__call__(points, labels)
         self.labels.append(result.labels)
         return result
@@ -140,7 +140,7 @@ def track_all(
     metrics = None
     (out / METRICS_FILE).unlink(missing_ok=True)  # an earlier run's would stand beside these tracks
     if sum(len(track.frames) - 1 for track in measured):
-        metrics = summarise_tracks(measured, category, *facts)
+        metrics = summarize_tracks(measured, category, *facts)
         metrics |= {
             "format": dataset.format,
             "split": dataset.split,

@@ -13,7 +13,7 @@ from caper_jax.cli import common
 from caper_jax.errors import CaperError
 
 if TYPE_CHECKING:
-    from caper_jax.training.run import RunConfig
+    from caper_jax.config import RunConfig
 
 
 ALL = "all"
@@ -115,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _train(category: str, arguments: argparse.Namespace, out: Path, initial: Path | None) -> int:
     """Trains one category; returns the exit code."""
-    from caper_jax.training import run
+    from caper_jax.training import train as run
 
     result = run.train(_configuration(category, arguments, initial), out, initial)
     if not result.finished:  # which says itself where it stopped
@@ -140,8 +140,8 @@ def _plot(category: str, out: Path) -> None:
 
 def _configuration(category: str, arguments: argparse.Namespace, initial: Path | None) -> RunConfig:
     """The run that the arguments describe; ``initial`` as for ``run.train``."""
-    from caper_jax.configuration import override, update
-    from caper_jax.training import run
+    from caper_jax.config import override, update
+    from caper_jax.training import train as run
 
     if initial is not None and arguments.preset is None:
         config = run.preset_of(initial, category)
@@ -171,7 +171,7 @@ def _configuration(category: str, arguments: argparse.Namespace, initial: Path |
 
 def _with_dataset(config: RunConfig, arguments: argparse.Namespace) -> RunConfig:
     """The configuration with --data, --format and --split in it."""
-    from caper_jax.data.loader import LoaderConfig
+    from caper_jax.config import LoaderConfig
 
     if arguments.data is None:
         for option in ("format", "split"):

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from caper_jax.cli import common
-from caper_jax.data import FORMATS
+from caper_jax.data.readers import FORMATS
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
 
@@ -88,7 +88,7 @@ class _BrokenFileError(CaperError):
 
 def _categories(arguments: argparse.Namespace) -> list[str]:
     from caper_jax import categories
-    from caper_jax.data import categories_in
+    from caper_jax.data.readers import categories_in
 
     wanted = None if arguments.category is None else categories.get(arguments.category).name
     try:
@@ -104,7 +104,7 @@ def _categories(arguments: argparse.Namespace) -> list[str]:
 
 
 def _check_split(arguments: argparse.Namespace, chosen: list[str]) -> None:
-    from caper_jax.data import splits_in
+    from caper_jax.data.readers import splits_in
 
     if arguments.split is None:
         return

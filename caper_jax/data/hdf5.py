@@ -18,7 +18,7 @@ import numpy as np
 from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.schema import Frame, pose_problems, pose_shapes
+from caper_jax.data.types import Frame, pose_problems, pose_shapes
 from caper_jax.errors import CaperError
 
 FORMAT = "caper"
@@ -53,7 +53,7 @@ def write(
       path: the file, usually ``<category>_<split>.h5``.
       category: what all frames show.
       split: e.g. "train" or "test".
-      points: [F, N, 3] metres, camera frame.
+      points: [F, N, 3] meters, camera frame.
       labels: [F, N] part of every point, -1 unknown.
       pose: arrays [F, K, ...].
       visible: [F, K] points or pixels that show each part.
@@ -93,7 +93,7 @@ def write(
         "category": category.name,
         "split": split,
         "mask_source": mask_source,
-        "units": "metres, radians",
+        "units": "meters, radians",
     }
 
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
@@ -259,7 +259,7 @@ def _fields(category: Category) -> list[str]:
 
 
 def _pack_points(points: np.ndarray) -> dict[str, np.ndarray]:
-    """int16 points [F, N, 3], their means [F, 1, 3] and scales [F, 1, 1] (metres per level)."""
+    """int16 points [F, N, 3], their means [F, 1, 3] and scales [F, 1, 1] (meters per level)."""
     if points.ndim != 3 or points.shape[-1] != 3 or 0 in points.shape:
         raise CaperError(f"points must be [F, N, 3], got {points.shape}")
     mean = points.mean(1, keepdims=True, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Depth images, masks and camera intrinsics, read strictly and in metres."""
+"""Depth images, masks and camera intrinsics, read strictly and in meters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 
 from caper_jax.errors import CaperError
 
-_MILLIMETRE = 1e-3
+_MILLIMETER = 1e-3
 # No depth camera sees objects nearer than 2 cm, or resolves one beyond 50 m.
 _NEAREST_M, _FARTHEST_M = 0.02, 50.0
 
@@ -19,20 +19,20 @@ _NEAREST_M, _FARTHEST_M = 0.02, 50.0
 def read_depth(path: str | Path, scale: float | None = None) -> np.ndarray:
     """Reads a depth image.
 
-    Integer images (16-bit PNG, integer ``.npy``) hold millimetres, float images (``.npy``, TIFF)
-    metres. An 8-bit colour PNG holds the millimetres of ArtImage, ``256 * green + red`` (channels
+    Integer images (16-bit PNG, integer ``.npy``) hold millimeters, float images (``.npy``, TIFF)
+    meters. An 8-bit color PNG holds the millimeters of ArtImage, ``256 * green + red`` (channels
     1 and 2 in BGR order).
 
     Args:
       path: the image.
-      scale: metres per unit of the file, where the above does not hold.
+      scale: meters per unit of the file, where the above does not hold.
 
     Returns:
-      [H, W] float32 metres; 0, NaN and infinity mark pixels without a measurement.
+      [H, W] float32 meters; 0, NaN and infinity mark pixels without a measurement.
 
     Raises:
       CaperError: missing or broken file, a kind of image that holds no depth (a picture, such as a
-        photo), or values that cannot be metres after scaling (the message says which unit they
+        photo), or values that cannot be meters after scaling (the message says which unit they
         seem to be in).
     """
     raw = read_array(path)
@@ -42,12 +42,12 @@ def read_depth(path: str | Path, scale: float | None = None) -> np.ndarray:
     elif raw.ndim != 2 or raw.dtype == np.uint8 or raw.dtype == bool:
         raise CaperError(
             f"{path}: {raw.dtype} image of shape {raw.shape} holds no depth; give a 16-bit "
-            "grayscale PNG in millimetres or a float .npy [H, W] in metres"
+            "grayscale PNG in millimeters or a float .npy [H, W] in meters"
         )
     if scale is not None and not (np.isfinite(scale) and scale > 0):
-        raise CaperError(f"depth scale must be a positive number of metres per unit, got {scale}")
+        raise CaperError(f"depth scale must be a positive number of meters per unit, got {scale}")
     integer = np.issubdtype(raw.dtype, np.integer)
-    unit = scale if scale is not None else (_MILLIMETRE if integer else 1.0)
+    unit = scale if scale is not None else (_MILLIMETER if integer else 1.0)
     depth = raw.astype(np.float32) * np.float32(unit)
     valid = np.isfinite(depth) & (depth > 0)
     if valid.any():
@@ -56,17 +56,17 @@ def read_depth(path: str | Path, scale: float | None = None) -> np.ndarray:
 
 
 def _refuse_picture(path: str | Path, raw: np.ndarray) -> None:
-    """Refuses colours [H, W, 3] that cannot be millimetres in two channels."""
-    grey = np.array_equal(raw[..., 0], raw[..., 1]) and np.array_equal(raw[..., 1], raw[..., 2])
+    """Refuses colors [H, W, 3] that cannot be millimeters in two channels."""
+    gray = np.array_equal(raw[..., 0], raw[..., 1]) and np.array_equal(raw[..., 1], raw[..., 2])
     if _is_jpeg(path):
         sign = "JPEG alters values"
-    elif grey and raw.any():  # all black is an image without a measurement
+    elif gray and raw.any():  # all black is an image without a measurement
         sign = "its three channels are equal"
     else:
         return
     raise CaperError(
         f"{path}: looks like a picture, not depth ({sign}); give a 16-bit grayscale PNG in "
-        "millimetres or a float .npy [H, W] in metres"
+        "millimeters or a float .npy [H, W] in meters"
     )
 
 
@@ -83,18 +83,18 @@ def _check_range(path: str | Path, median: float, integer: bool, scale: float | 
         advice = f"the depth scale {scale:g} does not fit this file"
     elif integer and median < _NEAREST_M:
         advice = (
-            "integers are read as millimetres, these seem to be whole metres or centimetres: "
-            "save 16-bit millimetres, or give the depth scale (metres per unit)"
+            "integers are read as millimeters, these seem to be whole meters or centimeters: "
+            "save 16-bit millimeters, or give the depth scale (meters per unit)"
         )
     elif integer:
         advice = (
-            "integers are read as millimetres, these are finer or no depth at all: give the depth "
-            "scale (metres per unit, e.g. 0.0001)"
+            "integers are read as millimeters, these are finer or no depth at all: give the depth "
+            "scale (meters per unit, e.g. 0.0001)"
         )
     elif median > _FARTHEST_M:
-        advice = "floats are read as metres, these seem to be millimetres: give the scale 0.001"
+        advice = "floats are read as meters, these seem to be millimeters: give the scale 0.001"
     else:
-        advice = "floats are read as metres, these are not: give the depth scale (metres per unit)"
+        advice = "floats are read as meters, these are not: give the depth scale (meters per unit)"
     raise CaperError(f"{path}: median depth would be {median:.3g} m; {advice}")
 
 
@@ -102,8 +102,8 @@ def read_mask(path: str | Path, allow_empty: bool = False) -> np.ndarray:
     """Reads the mask of one object: everything that is not black.
 
     Args:
-      path: grayscale, palette or colour image (transparent pixels are outside), or ``.npy``. In a
-        JPEG, whose black is not quite black, values above 127 count. Black is a colour: the number
+      path: grayscale, palette or color image (transparent pixels are outside), or ``.npy``. In a
+        JPEG, whose black is not quite black, values above 127 count. Black is a color: the number
         that a palette gives it means nothing.
       allow_empty: take a mask without a pixel, of a frame that does not show the object.
 
@@ -113,7 +113,7 @@ def read_mask(path: str | Path, allow_empty: bool = False) -> np.ndarray:
     Raises:
       CaperError: missing or broken file, wrong shape, or no pixel in the mask.
     """
-    raw = read_array(path, colours=True)
+    raw = read_array(path, colors=True)
     if raw.ndim not in (2, 3) or (raw.ndim == 3 and raw.shape[-1] not in (2, 3, 4)):
         raise CaperError(f"{path}: a mask must be an image, got an array of shape {raw.shape}")
     threshold = 127 if _is_jpeg(path) else 0
@@ -132,7 +132,7 @@ def read_labels(path: str | Path) -> np.ndarray:
     """Reads an image of labels: one integer per pixel, as stored.
 
     Args:
-      path: grayscale, 16-bit or palette image (the index is the label), a colour image whose
+      path: grayscale, 16-bit or palette image (the index is the label), a color image whose
         first channel in BGR order holds the label (ArtImage), or an integer ``.npy``.
 
     Returns:
@@ -151,10 +151,10 @@ def read_labels(path: str | Path) -> np.ndarray:
     return raw.astype(np.int32)
 
 
-def read_array(path: str | Path, colours: bool = False) -> np.ndarray:
+def read_array(path: str | Path, colors: bool = False) -> np.ndarray:
     """Pixels of an image or ``.npy`` file as stored: [H, W] or [H, W, C].
 
-    Palette images give their indices, or with ``colours`` RGBA; one-bit images give booleans.
+    Palette images give their indices, or with ``colors`` RGBA; one-bit images give booleans.
 
     Raises:
       CaperError: the file is missing, broken, or would need unpickling.
@@ -165,7 +165,7 @@ def read_array(path: str | Path, colours: bool = False) -> np.ndarray:
             return np.load(path, allow_pickle=False)
         with Image.open(path) as image:
             palette = image.mode in ("P", "PA")
-            return np.asarray(image.convert("RGBA") if colours and palette else image)
+            return np.asarray(image.convert("RGBA") if colors and palette else image)
     except UnidentifiedImageError as error:
         raise CaperError(f"{path}: not an image (PNG, JPEG, TIFF or .npy expected)") from error
     except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:

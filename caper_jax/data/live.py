@@ -8,7 +8,7 @@ points. All numbers are little-endian::
     4       uint32       version of this format, 1
     8       uint32       N, number of points; 0 for a frame that does not show the object
     12      uint32       sequence, a number that the sender gives the frame
-    16      float32 * 3N x, y, z of every point: metres, camera frame (OpenCV)
+    16      float32 * 3N x, y, z of every point: meters, camera frame (OpenCV)
 
 The stream may end after any whole frame.
 
@@ -41,7 +41,7 @@ class LiveFrame:
 
     Attributes:
       sequence: the number that its sender gave it.
-      points: [N, 3] float32 metres, camera frame; N may be 0.
+      points: [N, 3] float32 meters, camera frame; N may be 0.
       skipped: frames that came since the last one and were passed over.
     """
 
@@ -54,7 +54,7 @@ def pack_frame(points: np.ndarray, sequence: int = 0) -> bytes:
     """The bytes of one frame.
 
     Args:
-      points: [N, 3] metres, camera frame; N may be 0.
+      points: [N, 3] meters, camera frame; N may be 0.
       sequence: 0 or more; counts modulo 2^32.
 
     Raises:

@@ -1,10 +1,9 @@
-"""Shuffled batches of a labelled dataset, as a function of the step: exact resumes, no state."""
+"""Shuffled batches of a labeled dataset, as a function of the step: exact resumes, no state."""
 
 from __future__ import annotations
 
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import flax.struct
@@ -12,42 +11,18 @@ import jax
 import numpy as np
 
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.cloud import MIN_POINTS, systematic_indices
-from caper_jax.data.schema import Dataset, Frame, pose_problems
-from caper_jax.errors import CaperError, check_least
-from caper_jax.geometry.scan import scan_order
-
-
-@dataclass(frozen=True)
-class LoaderConfig:
-    """How a dataset is fed to training.
-
-    Attributes:
-      format: layout of the data (``data.FORMATS``).
-      root: file or folder.
-      split: split to train on; none for all there is.
-      workers: threads that read ahead.
-      prefetch: batches kept ready.
-      cache_gib: memory for frames that were read once; a set that fits is read once only.
-    """
-
-    format: str
-    root: str
-    split: str | None = "train"
-    workers: int = 2
-    prefetch: int = 4
-    cache_gib: float = 2.0
-
-    def __post_init__(self) -> None:
-        check_least("loader", self, workers=1, prefetch=0, cache_gib=0)
+from caper_jax.data.clouds import MIN_POINTS, systematic_indices
+from caper_jax.data.types import Dataset, Frame, pose_problems
+from caper_jax.errors import CaperError
+from caper_jax.geometry.raster_order import raster_order
 
 
 @flax.struct.dataclass
-class LabelledClouds:
+class LabeledClouds:
     """A batch from a dataset, with the fields of generated ones that training looks at.
 
     Attributes:
-      points: [B, N, 3] float32 metres, camera frame.
+      points: [B, N, 3] float32 meters, camera frame.
       labels: [B, N] int32 part of each point, -1 unknown.
       pose: ArticulatedPose with leading axis B, float32.
     """
@@ -85,7 +60,7 @@ class Loader:
         """Sets the threads up; nothing is read yet.
 
         Args:
-          dataset: labelled frames; read from several threads.
+          dataset: labeled frames; read from several threads.
           batch_size: B, rows of the global batch.
           num_points: N.
           seed: of the order and of the choice of points.
@@ -109,11 +84,11 @@ class Loader:
         self._seed = seed
         self._prefetch = prefetch
         self._orders: dict[int, np.ndarray] = {}
-        self._cache: dict[int, LabelledClouds | None] = {}
+        self._cache: dict[int, LabeledClouds | None] = {}
         self._free_bytes = int(cache_gib * 2**30)
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="loader")
-        self._ahead: dict[int, Future[LabelledClouds]] = {}
+        self._ahead: dict[int, Future[LabeledClouds]] = {}
 
     def __enter__(self) -> Loader:
         return self
@@ -125,7 +100,7 @@ class Loader:
         """Ends the threads; batches that were not asked for are dropped."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
-    def __call__(self, step: int) -> LabelledClouds:
+    def __call__(self, step: int) -> LabeledClouds:
         """This process's rows of the batch of a step, [B / processes, ...].
 
         Raises:
@@ -154,11 +129,11 @@ class Loader:
                 self._orders[epoch] = rng.permutation(len(self.dataset))
             return int(self._orders[epoch][rank]), epoch, rank
 
-    def _batch(self, step: int) -> LabelledClouds:
+    def _batch(self, step: int) -> LabeledClouds:
         rows = [self._row(step * self.batch_size + row) for row in self._rows]
         return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
-    def _row(self, position: int) -> LabelledClouds:
+    def _row(self, position: int) -> LabeledClouds:
         count = len(self.dataset)
         for skipped in range(count):
             index, epoch, rank = self._place(position + skipped)
@@ -172,9 +147,9 @@ class Loader:
             )
         rng = np.random.default_rng([self._seed, epoch, rank])
         picked = systematic_indices(len(frame.points), self._num_points, int(rng.integers(2**31)))
-        return LabelledClouds(frame.points[picked], frame.labels[picked], frame.pose)
+        return LabeledClouds(frame.points[picked], frame.labels[picked], frame.pose)
 
-    def _frame(self, index: int) -> LabelledClouds | None:
+    def _frame(self, index: int) -> LabeledClouds | None:
         """All points of a frame, or None if it shows too little; read once where memory allows."""
         try:
             return self._cache[index]
@@ -189,7 +164,7 @@ class Loader:
         return frame
 
 
-def _ready(frame: Frame, dataset: Dataset) -> LabelledClouds | None:
+def _ready(frame: Frame, dataset: Dataset) -> LabeledClouds | None:
     """What training needs of a frame, checked, in scan order; None if it shows too little."""
     where = f"frame {frame.name!r} of {dataset.category.name}"
     if frame.truth is None:
@@ -204,8 +179,8 @@ def _ready(frame: Frame, dataset: Dataset) -> LabelledClouds | None:
         return None
     labels = np.full(len(frame.points), -1) if frame.labels is None else frame.labels
     points, labels = frame.points[usable].astype(np.float32), labels[usable].astype(np.int32)
-    order = scan_order(points)
-    return LabelledClouds(
+    order = raster_order(points)
+    return LabeledClouds(
         points=points[order],
         labels=labels[order],
         pose=jax.tree.map(lambda array: np.asarray(array, np.float32), frame.truth),

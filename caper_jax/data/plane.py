@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from caper_jax.data.cloud import MIN_POINTS, back_project
+from caper_jax.data.clouds import MIN_POINTS, back_project
 from caper_jax.errors import CaperError
 
 # Error of a stereo camera, which grows with z^2: 2 mm at 0.7 m, as measured on a table.
@@ -26,10 +26,10 @@ def mask_from_box(
 
     The plane is the one with the most points in and around the box and the fewest behind it
     (RANSAC, then least squares): a table has nothing below it, the lid of a box does. What stands
-    above it inside the box, in the largest connected piece near the centre, is the object.
+    above it inside the box, in the largest connected piece near the center, is the object.
 
     Args:
-      depth: [H, W] metres; 0, NaN and infinity are unknown.
+      depth: [H, W] meters; 0, NaN and infinity are unknown.
       intrinsics: [3, 3] pixels.
       box: (x1, y1, x2, y2) pixels, x to the right: x1 <= u < x2 and y1 <= v < y2. What sticks out
         of the image is cut off.
@@ -87,11 +87,11 @@ def fit_support_plane(points: np.ndarray, seed: int = 0) -> tuple[np.ndarray, fl
     """The plane ``normal . p + offset = 0`` that carries what is seen; the camera is above it.
 
     Args:
-      points: [N, 3] metres, camera frame.
+      points: [N, 3] meters, camera frame.
       seed: of the random hypotheses.
 
     Returns:
-      (normal [3] of unit length towards the camera's side, offset > 0 in metres).
+      (normal [3] of unit length towards the camera's side, offset > 0 in meters).
 
     Raises:
       CaperError: the points lie on no plane seen from above.
@@ -128,7 +128,7 @@ def fit_support_plane(points: np.ndarray, seed: int = 0) -> tuple[np.ndarray, fl
 
 
 def _noise(depth: np.ndarray) -> np.ndarray:
-    """Expected error of a depth camera at ``depth``, metres."""
+    """Expected error of a depth camera at ``depth``, meters."""
     return _NOISE_M + _NOISE_PER_M * depth**2
 
 
@@ -148,7 +148,7 @@ def _central_piece(
 def connected_components(mask: np.ndarray) -> np.ndarray:
     """Labels pixels that touch along an edge: [H, W] int, the same number within a piece.
 
-    Every pixel points at its smallest neighbour and then, repeatedly, at where that one points;
+    Every pixel points at its smallest neighbor and then, repeatedly, at where that one points;
     pointers halve their way, so even winding pieces need few rounds.
     """
     height, width = mask.shape

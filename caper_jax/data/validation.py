@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from caper_jax.articulation.category import Category
-from caper_jax.data import open_dataset, splits_in
-from caper_jax.data.cloud import MIN_POINTS
-from caper_jax.data.schema import Dataset, Frame, NoFramesError, frame_problems, pose_shapes
+from caper_jax.data.clouds import MIN_POINTS
+from caper_jax.data.readers import open_dataset, splits_in
+from caper_jax.data.types import Dataset, Frame, NoFramesError, frame_problems, pose_shapes
 from caper_jax.errors import CaperError
 from caper_jax.progress import progress
 

@@ -40,7 +40,7 @@ def by_opening(errors: PoseErrors, state: np.ndarray, category: Category) -> lis
 
     Args:
       errors: of F frames.
-      state: [F, J] true joint states, radians or metres.
+      state: [F, J] true joint states, radians or meters.
       category: knows the joints' limits, between which the opening is a share, and which of them is
         closed; states beyond count as the limit.
     """

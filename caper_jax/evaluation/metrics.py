@@ -1,7 +1,7 @@
 """Errors of estimated poses, frame by frame, as the conventions define them.
 
 Everything is computed in float64; rotations by the atan2 form, so that the ground truth scored
-against itself reads 0 degrees, 0 metres and an IoU of 1.
+against itself reads 0 degrees, 0 meters and an IoU of 1.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from caper_jax.articulation.category import Category
-from caper_jax.articulation.equivalence import is_ambiguous, second_reading
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.schema import pose_shapes
+from caper_jax.articulation.symmetry import apply_symmetry, is_ambiguous
+from caper_jax.data.types import pose_shapes
 from caper_jax.errors import CaperError
-from caper_jax.geometry import boxes, linalg, so3
+from caper_jax.geometry import boxes
+from caper_jax.lie import linalg, so3
 
 FAILED_ROTATION_DEG = 180.0
 # What a frame without an estimate scores, in the words of the report.
@@ -42,10 +43,10 @@ class PoseErrors:
       translation_m: [F, K] distance of the part origins.
       translation_relative: [F, K] the same over the true ``object_diagonal``.
       iou_full: [F, K] IoU of the oriented boxes in the camera frame.
-      iou_size: [F, K] IoU of the boxes' sizes alone, as if they shared centre and rotation.
+      iou_size: [F, K] IoU of the boxes' sizes alone, as if they shared center and rotation.
       axis_deg: [F, J] angle of the joint axes in the root's frame; the sign counts.
       pivot_m: [F, J] distance of the estimated pivot from the true axis; NaN for prismatic joints.
-      state: [F, J] degrees (revolute) or metres (prismatic).
+      state: [F, J] degrees (revolute) or meters (prismatic).
     """
 
     rotation_deg: np.ndarray
@@ -112,15 +113,15 @@ def pose_errors_up_to_symmetry(
 
     Better is the reading, frame by frame, whose root is turned less from the estimate's; all
     errors of the frame are those against that reading. An instance whose exchanged parts are not
-    alike (``Equivalence.tolerance``) has one reading.
+    alike (``Symmetry.tolerance``) has one reading.
 
     Args and errors as for ``pose_errors``.
     """
-    readings = [truth, *(second_reading(truth, e, category) for e in category.equivalences)]
+    readings = [truth, *(apply_symmetry(truth, e, category) for e in category.symmetries)]
     scores = [pose_errors(estimate, reading, category, failed) for reading in readings]
     turns = [score.rotation_deg[:, 0] for score in scores]
-    for number, equivalence in enumerate(category.equivalences, start=1):
-        alike = np.asarray(is_ambiguous(np.asarray(truth.size), equivalence))
+    for number, symmetry in enumerate(category.symmetries, start=1):
+        alike = np.asarray(is_ambiguous(np.asarray(truth.size), symmetry))
         turns[number] = np.where(alike, turns[number], np.inf)
     best = np.argmin(turns, axis=0)
     frames = np.arange(len(best))
@@ -133,7 +134,7 @@ def pose_errors_up_to_symmetry(
 
 
 def object_diagonal(pose: ArticulatedPose) -> np.ndarray:
-    """[F] metres, diagonal of the box around all parts at rest."""
+    """[F] meters, diagonal of the box around all parts at rest."""
     half = np.asarray(pose.size, np.float64) / 2
     center = np.asarray(pose.box_center, np.float64)
     return np.linalg.norm((center + half).max(-2) - (center - half).min(-2), axis=-1)
@@ -166,12 +167,12 @@ def _errors(guess: dict[str, jax.Array], true: dict[str, jax.Array]) -> dict[str
 
 
 def _box_center(arrays: dict[str, jax.Array]) -> jax.Array:
-    """[..., K, 3] centres of the parts' boxes in the camera frame."""
+    """[..., K, 3] centers of the parts' boxes in the camera frame."""
     return linalg.apply(arrays["rotation"], arrays["box_center"]) + arrays["translation"]
 
 
 def _axis_distance(arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """[F, J] metres from the camera to the joint axes, which rest in the root's frame."""
+    """[F, J] meters from the camera to the joint axes, which rest in the root's frame."""
     root = arrays["rotation"][:, None, 0]
     axis = np.einsum("fjab,fjb->fja", root, arrays["joint_axis"])
     pivot = np.einsum("fjab,fjb->fja", root, arrays["joint_pivot"])

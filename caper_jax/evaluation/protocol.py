@@ -14,16 +14,16 @@ import numpy as np
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.cloud import MIN_POINTS, sample_points
-from caper_jax.data.schema import Dataset, Frame, pose_problems, pose_shapes
+from caper_jax.data.clouds import MIN_POINTS, sample_points
+from caper_jax.data.types import Dataset, Frame, pose_problems, pose_shapes
 from caper_jax.errors import CaperError
-from caper_jax.geometry import se3
+from caper_jax.lie import se3
 from caper_jax.progress import progress
 
 BATCH_SIZE = 16
 NUM_POINTS = 1024
 
-# Poses [B, K, ...] for B frames and their clouds [B, N, 3], metres.
+# Poses [B, K, ...] for B frames and their clouds [B, N, 3], meters.
 Predictor = Callable[[Sequence[Frame], np.ndarray], ArticulatedPose]
 
 
@@ -58,7 +58,7 @@ def evaluate(
     """Estimates every frame, in batches of one fixed shape so that nothing compiles twice.
 
     Args:
-      dataset: labelled frames.
+      dataset: labeled frames.
       predictor: e.g. ``model_predictor(estimator)``.
       limit: at most so many frames, from the first.
       batch_size: frames per call; the last batch is filled up with copies.
@@ -128,7 +128,7 @@ def mean_predictor(category: Category, mean_pose: Mapping[str, Any], source: str
 
     Args:
       category: gives the shapes and the tree of parts.
-      mean_pose: "rotation" [3, 3] and "offset" [3] of the root (camera frame, metres from the mean
+      mean_pose: "rotation" [3, 3] and "offset" [3] of the root (camera frame, meters from the mean
         of the cloud), "size" and "box_center" [K, 3], "joint_axis" and "joint_pivot" [J, 3],
         "joint_state" [J].
       source: the file to name in errors.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from caper_jax.articulation.category import Category
-from caper_jax.data.schema import Dataset
+from caper_jax.data.types import Dataset
 from caper_jax.evaluation.breakdown import by_occlusion, by_opening, format_bins
 from caper_jax.evaluation.metrics import (
     FAILURE_VALUES,
@@ -27,10 +27,10 @@ from caper_jax.files import write_atomically
 
 METRICS_FILE = "metrics.json"
 PREDICTIONS_FILE = "predictions.npz"
-_STATE_UNITS = {"revolute": "degrees", "prismatic": "metres"}
+_STATE_UNITS = {"revolute": "degrees", "prismatic": "meters"}
 
 
-def summarise(
+def summarize(
     evaluation: Evaluation, dataset: Dataset, predictor: str, weights: str | None
 ) -> dict[str, Any]:
     """The content of metrics.json: counts, and mean and median of every error.
@@ -39,7 +39,7 @@ def summarise(
     "by_opening" holds the errors of frames in which the object is closed, ajar or open, where the
     category knows such a thing, and, where the data say how much of each part is visible,
     "by_occlusion" those of the parts within each bin of paper Table 8. For a category with declared
-    equivalences, "up_to_symmetry" holds the errors against the better reading of the truth; all the
+    symmetries, "up_to_symmetry" holds the errors against the better reading of the truth; all the
     others never do.
 
     Args:
@@ -69,9 +69,9 @@ def summarise(
         report["by_opening"] = by_opening(errors, state, category)
     if not np.isnan(evaluation.visibility).all():
         report["by_occlusion"] = by_occlusion(errors, evaluation.visibility, category)
-    if category.equivalences:
+    if category.symmetries:
         report["up_to_symmetry"] = {
-            "reasons": [equivalence.reason for equivalence in category.equivalences],
+            "reasons": [symmetry.reason for symmetry in category.symmetries],
             **error_tables(pose_errors_up_to_symmetry(*arguments), category),
         }
     return report
@@ -105,15 +105,15 @@ def write_report(folder: str | Path, evaluation: Evaluation, report: dict[str, A
     """Writes metrics.json and predictions.npz, each whole or not at all.
 
     predictions.npz holds, for F frames in order, ``frame`` (names), ``failed`` [F] and the
-    estimates ``R`` [F, K, 3, 3], ``t``, ``size``, ``box_center`` [F, K, 3] (metres),
-    ``joint_axis``, ``joint_pivot`` [F, J, 3], ``joint_state`` [F, J] (radians or metres), NaN where
+    estimates ``R`` [F, K, 3, 3], ``t``, ``size``, ``box_center`` [F, K, 3] (meters),
+    ``joint_axis``, ``joint_pivot`` [F, J, 3], ``joint_state`` [F, J] (radians or meters), NaN where
     failed, and the ground truth under the same names with ``truth_`` before; ``visibility`` [F, K]
     is NaN where unknown. Every error in metrics.json can be computed from it.
 
     Args:
       folder: exists.
       evaluation: the estimates.
-      report: from ``summarise``.
+      report: from ``summarize``.
     """
     arrays: dict[str, np.ndarray] = {
         "frame": np.array(evaluation.names),
@@ -181,13 +181,13 @@ def format_tables(tables: dict[str, Any]) -> list[str]:
     lines = [*align(rows), *textwrap.wrap(f"over {TURNED_DEG:.0f} deg: {shares}", 80), ""]
     rows = [["joint", "axis [deg]", "pivot [mm]", "state"]]
     for joint, part in zip(tables["joints"], tables["parts"][1:], strict=True):
-        metres = joint["state_unit"] == "metres"
+        meters = joint["state_unit"] == "meters"
         rows.append(
             [
                 f"{part['name']} ({joint['type']})",
                 cell(joint["axis_deg"], 1, 2),
                 cell(joint["pivot_m"], 1000, 1),
-                cell(joint["state"], 1000 if metres else 1, 2) + (" mm" if metres else " deg"),
+                cell(joint["state"], 1000 if meters else 1, 2) + (" mm" if meters else " deg"),
             ]
         )
     return lines + align(rows)

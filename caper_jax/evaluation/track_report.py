@@ -10,20 +10,20 @@ import jax
 import numpy as np
 
 from caper_jax.articulation.category import Category
+from caper_jax.config import TrackerConfig
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.report import format_tables
 from caper_jax.evaluation.summaries import align
 from caper_jax.evaluation.tracking import Start, Track
-from caper_jax.tracking.config import TrackerConfig
-from caper_jax.tracking.step import Tracked
+from caper_jax.tracking.step import TrackResult
 
 _NAME_WIDTH = 30  # of a video in a table
 
 
 def frame_record(
-    frame: str | int, result: Tracked, category: Category, seconds: float
+    frame: str | int, result: TrackResult, category: Category, seconds: float
 ) -> dict[str, Any]:
-    """One frame, JSON-ready: metres and degrees, camera frame (OpenCV).
+    """One frame, JSON-ready: meters and degrees, camera frame (OpenCV).
 
     "parts" holds by name rotation [3, 3] and translation [3] (part frame -> camera), size [3] and
     box_center [3] (rest frame of the part); "joints" by the name of the part that they carry type,
@@ -43,7 +43,7 @@ def frame_record(
         raise CaperError(
             f"frame {frame}: the model gave no finite pose; check the masks and the unit of depth"
         )
-    # A tenth of a micrometre, or of a microradian: below what float32 holds. + 0.0 mends -0.0.
+    # A tenth of a micrometer, or of a microradian: below what float32 holds. + 0.0 mends -0.0.
     rounded = {key: value.round(7) + 0.0 for key, value in pose.items()}
     parts = {
         name: {
@@ -59,7 +59,7 @@ def frame_record(
         joints[category.parts[joint + 1]] = {
             "type": kind,
             "state": round(float(np.degrees(state)) if turns else state, 6),
-            "unit": "degrees" if turns else "metres",
+            "unit": "degrees" if turns else "meters",
             "axis": rounded["joint_axis"][joint].tolist(),
             "pivot": rounded["joint_pivot"][joint].tolist() if turns else None,
         }
@@ -87,7 +87,7 @@ def track_records(track: Track, category: Category) -> Iterator[dict[str, Any]]:
       CaperError: a pose that is not finite.
     """
     for index, frame in enumerate(track.frames):
-        result = Tracked(
+        result = TrackResult(
             pose=jax.tree.map(lambda array, i=index: array[i], track.pose),
             labels=None,
             energy=track.energy[index],
@@ -116,7 +116,7 @@ def format_tracks(
       start: as given to ``track_video``.
       mask_source: of the object masks.
       part_masks: "predicted" or "given".
-      metrics: from ``summarise_tracks``.
+      metrics: from ``summarize_tracks``.
     """
     frames = sum(len(track.frames) for track in tracks)
     lines = [
@@ -153,8 +153,8 @@ def _describe(config: TrackerConfig) -> str:
     if config.policy == "none":
         return "none"
     described = f"{config.policy}, energy above {config.threshold:g}"
-    if config.unseen < 1.0:
-        described += f" or {100 * config.unseen:.0f} % unseen"
+    if config.max_unmatched < 1.0:
+        described += f" or {100 * config.max_unmatched:.0f} % unseen"
     return described
 
 

@@ -1,4 +1,4 @@
-"""Runs a tracker over labelled videos: how each begins, what is given, and what counts."""
+"""Runs a tracker over labeled videos: how each begins, what is given, and what counts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.schema import Frame
+from caper_jax.data.types import Frame
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.metrics import PoseErrors, pose_errors
 from caper_jax.evaluation.report import error_tables
@@ -29,10 +29,10 @@ class Track:
     Attributes:
       name: the video's.
       frames: T names.
-      pose: arrays [T, K, ...], metres.
+      pose: arrays [T, K, ...], meters.
       truth: likewise; None where the data have none.
       energy: [T] Eq 16, relative to the object's diagonal.
-      keyframe, estimated, lost: [T] bool, see ``tracking.step.Tracked``.
+      keyframe, estimated, lost: [T] bool, see ``tracking.step.TrackResult``.
       seconds: [T] from points to pose, after a first call that compiles.
     """
 
@@ -63,7 +63,7 @@ def track_video(
       start: where frame 0's pose comes from: the ground truth's part poses (and nothing else of
         it), as in the paper, or the static estimator. Ground truth is not looked at afterwards.
       given_masks: hand over the data's part labels instead of predicting them; results of such a
-        run are to be labelled so.
+        run are to be labeled so.
 
     Raises:
       CaperError: no frames, or a start or masks that the data do not have.
@@ -131,7 +131,7 @@ def joined_tables(
     return error_tables(joined, category)
 
 
-def summarise_tracks(
+def summarize_tracks(
     tracks: Sequence[Track], category: Category, start: Start, mask_source: str, part_masks: str
 ) -> dict[str, Any]:
     """JSON-ready metrics over all frames of all videos but the first of each (Sec 6.3).

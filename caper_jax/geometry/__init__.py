@@ -1,5 +1,6 @@
 """Geometry: rotations, rigid transforms, directions, boxes and solids."""
 
-from caper_jax.geometry import boxes, directions, linalg, se3, so3, solids
+from caper_jax.geometry import boxes, solids, two_axis_rotation
+from caper_jax.lie import linalg, se3, so3
 
-__all__ = ["boxes", "directions", "linalg", "se3", "so3", "solids"]
+__all__ = ["boxes", "linalg", "se3", "so3", "solids", "two_axis_rotation"]

@@ -38,7 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from caper_jax.geometry.linalg import apply, as_floating, dot, multiply, transpose
+from caper_jax.lie.linalg import apply, as_floating, dot, multiply, transpose
 
 # Faces are numbered box * 6 + axis * 2 + (0 for the positive side, 1 for the negative).
 _INDEX = np.arange(12)
@@ -46,7 +46,7 @@ _SIGN = np.array([1.0, -1.0])
 # Planes that can cut face i: all but itself and the opposite face of its own box.
 _CUTS = (_INDEX[:, None] // 2) != (_INDEX[None, :] // 2)
 _FIRST = _INDEX[:, None] < _INDEX[None, :]
-# How far out (metres) a line stands for a plane that never cuts a face, or leaves none of it.
+# How far out (meters) a line stands for a plane that never cuts a face, or leaves none of it.
 _FAR = 1e6
 
 
@@ -57,9 +57,9 @@ def corners(
 
     Args:
       rotation: [..., 3, 3] part frame -> camera.
-      translation: [..., 3] metres.
-      center: [..., 3] metres, box centre in the part frame.
-      size: [..., 3] metres, full extents.
+      translation: [..., 3] meters.
+      center: [..., 3] meters, box center in the part frame.
+      size: [..., 3] meters, full extents.
     """
     rotation = as_floating(rotation, (3, 3), "rotation")
     translation = as_floating(translation, (3,), "translation")
@@ -71,7 +71,7 @@ def corners(
 
 
 def iou_size(size_a: ArrayLike, size_b: ArrayLike) -> jax.Array:
-    """Intersection over union [...] of two boxes of sizes [..., 3] with common centre and axes.
+    """Intersection over union [...] of two boxes of sizes [..., 3] with common center and axes.
 
     0 where a size is not finite or not positive.
     """
@@ -97,8 +97,8 @@ def iou_full(
 
     Args:
       rotation_a: [..., 3, 3] box axes (columns) in a common frame.
-      center_a: [..., 3] metres, box centre in that frame.
-      size_a: [..., 3] metres, full extents.
+      center_a: [..., 3] meters, box center in that frame.
+      size_a: [..., 3] meters, full extents.
       rotation_b: [..., 3, 3].
       center_b: [..., 3].
       size_b: [..., 3].
@@ -175,7 +175,7 @@ def _half_spaces(
 def _both(
     rotation: jax.Array, center: jax.Array, half_a: jax.Array, half_b: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Axes [..., 2, 3 (axis), 3], centres [..., 2, 3] and half extents [..., 2, 3] of the boxes."""
+    """Axes [..., 2, 3 (axis), 3], centers [..., 2, 3] and half extents [..., 2, 3] of the boxes."""
     batch = jnp.broadcast_shapes(
         rotation.shape[:-2], center.shape[:-1], half_a.shape[:-1], half_b.shape[:-1]
     )
@@ -195,7 +195,7 @@ def _faces(
     """Area [..., 12] of each face of the intersection, and area times centroid [..., 12, 3]."""
     axes, origins, halves = _both(rotation, center, half_a, half_b)
     normals, offsets = _half_spaces(rotation, center, half_a, half_b)
-    # Coordinates in the plane of a face: its centre, and the two other axes of its own box.
+    # Coordinates in the plane of a face: its center, and the two other axes of its own box.
     batch = normals.shape[:-2]
     tangents = [
         jnp.repeat(jnp.roll(axes, -turn, axis=-2), 2, axis=-2).reshape(*batch, 12, 3)

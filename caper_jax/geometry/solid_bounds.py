@@ -65,7 +65,7 @@ def _reached(solid: Solid, direction: np.ndarray) -> bool:
 
 
 def corners_after_cut(solid: Solid) -> np.ndarray:
-    """Corners [n, 3] (metres) of the pieces of a solid that its hole leaves.
+    """Corners [n, 3] (meters) of the pieces of a solid that its hole leaves.
 
     Raises:
       CaperError: the hole swallows the whole solid.
@@ -87,14 +87,14 @@ def corners_after_cut(solid: Solid) -> np.ndarray:
 
 
 def _points(solid: Solid, unit: np.ndarray) -> np.ndarray:
-    """Points [n, 3] of the unit solid before it is tapered, in the object's frame, metres."""
+    """Points [n, 3] of the unit solid before it is tapered, in the object's frame, meters."""
     scale = 1 + (unit[:, 2:] + 1) / 2 * (np.array(solid.taper) - 1)
     local = np.concatenate([unit[:, :2] * scale, unit[:, 2:]], axis=1)
     return solid.center + (local * solid.half) @ solid.rotation.T
 
 
 def _planes(hole: Solid) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals [m, 3] and offsets [m] of planes around a hole, ``n . x <= b``; metres."""
+    """Unit normals [m, 3] and offsets [m] of planes around a hole, ``n . x <= b``; meters."""
     if hole.kind == "ellipsoid":
         unit = gradient = _sphere()[0]
     else:

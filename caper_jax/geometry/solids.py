@@ -28,8 +28,8 @@ class Solid:
     Attributes:
       kind: "box", "cylinder", "ellipsoid", "frustum" or "cone" (round ones are elliptic when their
         half extents differ).
-      center: [3] metres, object rest-canonical frame; the middle of the unit solid's [-1, 1]^3.
-      half: [3] half extents, metres.
+      center: [3] meters, object rest-canonical frame; the middle of the unit solid's [-1, 1]^3.
+      half: [3] half extents, meters.
       rotation: [3, 3].
       hole: a convex solid cut away (its own hole is ignored), or None.
       taper: (x, y) scale of the end at z = 1, each in (0, 1]; equal for a cone, 1 for kinds that
@@ -44,7 +44,7 @@ class Solid:
     taper: tuple[float, float] = (1.0, 1.0)
 
     def moved(self, offset: np.ndarray) -> Solid:
-        """This solid (and its hole) shifted by ``offset`` [3] metres."""
+        """This solid (and its hole) shifted by ``offset`` [3] meters."""
         hole = None if self.hole is None else self.hole.moved(offset)
         return replace(self, center=self.center + offset, hole=hole)
 
@@ -54,7 +54,7 @@ class Solid:
         if self.kind == "ellipsoid":
             reach = np.sqrt(x**2 + y**2 + z**2)
             return self.center - reach, self.center + reach
-        # The ends at z = -1 and z = 1 reach this far to either side of their own centres.
+        # The ends at z = -1 and z = 1 reach this far to either side of their own centers.
         if self.kind in ("box", "frustum"):
             start = np.abs(x) + np.abs(y)
             end = np.abs(self.taper[0] * x) + np.abs(self.taper[1] * y)
@@ -71,7 +71,7 @@ class Solid:
 
 
 def box(center, half, rotation=None, hole: Solid | None = None) -> Solid:
-    """A box from its centre [3], half extents [3] (metres) and optional rotation [3, 3].
+    """A box from its center [3], half extents [3] (meters) and optional rotation [3, 3].
 
     Raises:
       CaperError: wrong shapes, or half extents that are not positive (as do the other kinds).

@@ -1,1 +1,1 @@
-"""Pose tracking (paper Sec 5.3): proxy canonicalisation, pose increments, dynamic keyframes."""
+"""Pose tracking (paper Sec 5.3): proxy canonicalization, pose increments, dynamic keyframes."""

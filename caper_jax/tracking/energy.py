@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from caper_jax.networks.graph import squared_distances
+from caper_jax.models.encoders.neighbors import squared_distances
 
 
 def chamfer_energy(points, labels, key_points, key_labels, num_parts: int, size):

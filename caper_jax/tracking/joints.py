@@ -7,14 +7,14 @@ from dataclasses import replace
 import jax.numpy as jnp
 
 from caper_jax.articulation.category import Category
-from caper_jax.geometry import linalg, se3, so3
-from caper_jax.tracking.state import Constants
+from caper_jax.lie import linalg, se3, so3
+from caper_jax.tracking.state import ObjectParameters
 
 # Motion from rest at which a pose tells as much about its joint as one frame's votes do.
 _TURN, _SLIDE, _PIVOT = 0.1, 0.1, 0.1
 
 
-def joints_from_poses(parts, votes: Constants, category: Category):
+def joints_from_poses(parts, votes: ObjectParameters, category: Category):
     """Joint states, axes and pivots that fit given part poses, as far as these determine them.
 
     A child's pose in its parent's frame is ``[R | (I - R) q]`` (Eq 8): the axis of R is the

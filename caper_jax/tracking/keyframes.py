@@ -8,12 +8,23 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from caper_jax.geometry import linalg, se3, so3
-from caper_jax.networks.turns import NUM_TURNS, TURNS, turn_between, turned_pose
-from caper_jax.tracking.config import TrackerConfig
-from caper_jax.tracking.fix import Fix, estimate_fix, measure, misfit, own_coordinates
+from caper_jax.config import TrackerConfig
+from caper_jax.lie import linalg, se3, so3
+from caper_jax.models.rotation_classes import (
+    CUBE_ROTATIONS,
+    NUM_CUBE_ROTATIONS,
+    nearest_cube_rotation,
+    rotate_pose,
+)
+from caper_jax.tracking.measurement import (
+    PoseMeasurement,
+    box_residual,
+    estimate_measurement,
+    measure,
+    own_coordinates,
+)
 from caper_jax.tracking.registration import (
-    Surface,
+    SurfaceMap,
     empty_surface,
     extend_surface,
     move_surface,
@@ -21,10 +32,10 @@ from caper_jax.tracking.registration import (
 from caper_jax.tracking.state import Keyframe, TrackerState
 
 _LONG = 2  # frames beyond the patience after which an estimate that is not sure counts as well
-_BETTER = 0.6  # misfit of an estimate over the track's, at which it may replace the track
+_BETTER = 0.6  # box_residual of an estimate over the track's, at which it may replace the track
 
 
-def is_due(energy, unmatched, age, config: TrackerConfig):
+def is_keyframe(energy, unmatched, age, config: TrackerConfig):
     """Whether the policy wants this frame as keyframe.
 
     Args:
@@ -37,10 +48,10 @@ def is_due(energy, unmatched, age, config: TrackerConfig):
         return jnp.asarray(True)
     if config.policy == "fixed":
         return age + 1 >= config.interval
-    return (energy > config.threshold) | (unmatched > config.unseen)
+    return (energy > config.threshold) | (unmatched > config.max_unmatched)
 
 
-def contradicts(first, second, config: TrackerConfig):
+def poses_disagree(first, second, config: TrackerConfig):
     """Whether two root poses [4, 4] contradict each other, not only differ."""
     turn = so3.geodesic_distance(first[:3, :3], second[:3, :3])
     shift = linalg.norm(first[:3, 3] - second[:3, 3])
@@ -60,7 +71,7 @@ class Correction:
       replaced: [] bool, whether the track gave way altogether.
     """
 
-    fix: Fix
+    fix: PoseMeasurement
     variance: Any
     vote: Any
     asked: Any
@@ -72,11 +83,11 @@ def corrected(
     variables,
     points,
     labels,
-    tracked: Fix,
+    tracked: PoseMeasurement,
     outside,
     state: TrackerState,
     due,
-    doubtful,
+    num_inconsistent,
     turned,
     category,
     network,
@@ -92,36 +103,38 @@ def corrected(
     Args:
       variables, points, labels, category, network: as for ``fix.measure``.
       tracked: the track's pose.
-      outside: [] the track's ``misfit`` in this frame.
+      outside: [] the track's ``box_residual`` in this frame.
       state: before this frame.
       due: [] bool, the policy wants a keyframe.
-      doubtful: [] int32, so many frames in a row, this one included, contradicted the track; from
-        ``patience`` on it is doubted.
+      num_inconsistent: [] int32, frames in a row, this one included, that contradicted the track;
+        from ``patience`` on it is doubted.
       turned: [] int32, by which turn the track is off; 0: by none.
       config: static.
     """
-    doubted = doubtful >= config.patience
+    doubted = num_inconsistent >= config.patience
     asked = state.lost | doubted | (state.trial > 0)
     if config.policy in ("fixed", "dynamic"):
         asked |= due
     static = jax.lax.cond(
         asked,
-        lambda: estimate_fix(variables, points, labels, category, network),
+        lambda: estimate_measurement(variables, points, labels, category, network),
         lambda: tracked,
     )
-    sure = asked & ((static.sure >= config.sure) | (doubtful >= config.patience + _LONG))
+    sure = asked & (
+        (static.sure >= config.min_confidence) | (num_inconsistent >= config.patience + _LONG)
+    )
     # Later the track has seen more than a single frame shows.
     votes = turn_votes(state.vote, tracked.root, static.root, config)
     vote = jnp.where(sure & (state.trial > 0), votes, state.vote)
-    outvoted = (vote.max() > config.turned) & ~state.lost & (turned == 0)
+    outvoted = (vote.max() > config.flip_log_odds) & ~state.lost & (turned == 0)
     turned = jnp.where(outvoted, vote.argmax().astype(jnp.int32), turned)
-    reference = turned_pose(tracked.root, jnp.asarray(TURNS, tracked.root.dtype)[turned])
+    reference = rotate_pose(tracked.root, jnp.asarray(CUBE_ROTATIONS, tracked.root.dtype)[turned])
     static = jax.lax.cond(
         turned > 0,
         lambda: measure(variables, points, labels, reference, category, network),
         lambda: static,
     )
-    better = misfit(static, points) < _BETTER * outside
+    better = box_residual(static, points) < _BETTER * outside
     replaced = state.lost | (doubted & sure & better) | (turned > 0)
 
     static_variance = jnp.square(
@@ -129,9 +142,9 @@ def corrected(
     )
     drift = jnp.array([config.drift_rotation, config.drift_translation, config.drift_joint])
     grown = state.variance + jnp.where(due, jnp.square(drift), 0.0)
-    if config.filtered:
-        # One that contradicts the track is not averaged in: a mean of two poses is neither.
-        apart = contradicts(tracked.root, static.root, config)
+    if config.kalman:
+        # One that poses_disagree the track is not averaged in: a mean of two poses is neither.
+        apart = poses_disagree(tracked.root, static.root, config)
         gain = jnp.where(apart | ~sure, 0.0, grown / (grown + static_variance))
     else:
         gain = jnp.ones(3)
@@ -139,7 +152,7 @@ def corrected(
 
     correction = se3.log(se3.compose(se3.inverse(tracked.root), static.root))
     correction *= jnp.repeat(gain[:2], 3, total_repeat_length=6)
-    fused = Fix(
+    fused = PoseMeasurement(
         root=se3.compose(tracked.root, se3.exp(correction)),
         joint_state=tracked.joint_state + gain[2] * (static.joint_state - tracked.joint_state),
         parts=se3.interpolate(tracked.parts, static.parts, gain[2]),
@@ -148,7 +161,7 @@ def corrected(
         sure=tracked.sure,
         turn=tracked.turn,
     )
-    fix = select(replaced, static, fused)
+    fix = tree_where(replaced, static, fused)
     # (1 - gain) grown, which would cancel where the gain is nearly one.
     left = jnp.where(gain > 0, gain * static_variance, grown)
     variance = jnp.where(replaced, static_variance, left)
@@ -166,18 +179,22 @@ def turn_votes(before, tracked, static, config: TrackerConfig):
       tracked, static: [4, 4] root poses.
       config: static.
     """
-    index, left = turn_between(tracked[:3, :3], static[:3, :3])
-    votes = jnp.where(jnp.arange(NUM_TURNS) == index, config.vote, -config.vote).at[0].set(0.0)
+    index, left = nearest_cube_rotation(tracked[:3, :3], static[:3, :3])
+    votes = (
+        jnp.where(jnp.arange(NUM_CUBE_ROTATIONS) == index, config.log_odds, -config.log_odds)
+        .at[0]
+        .set(0.0)
+    )
     votes = jnp.where(left < jnp.radians(config.gate_deg), votes, 0.0)
     return added(before, votes, config)
 
 
 def added(before, votes, config: TrackerConfig):
     """Log odds [24] of turns and what one frame adds, from a least value up."""
-    return jnp.maximum(before + votes, jnp.minimum(before, -config.turned))
+    return jnp.maximum(before + votes, jnp.minimum(before, -config.flip_log_odds))
 
 
-def make_keyframe(fix: Fix, points) -> Keyframe:
+def make_keyframe(fix: PoseMeasurement, points) -> Keyframe:
     """A frame of this pose and cloud [N, 3] as keyframe."""
     return Keyframe(
         root=fix.root,
@@ -189,20 +206,22 @@ def make_keyframe(fix: Fix, points) -> Keyframe:
     )
 
 
-def moved_cloud(key: Keyframe, fix: Fix):
+def moved_cloud(key: Keyframe, fix: PoseMeasurement):
     """The keyframe's cloud [N, 3], each part moved by its increment, in the root's frame."""
     motions = se3.compose(fix.parts, se3.inverse(key.parts))
     return se3.act(motions[key.labels], key.points[:, None])[:, 0]
 
 
-def grown_surface(surface: Surface, fix: Fix, points, config: TrackerConfig) -> Surface:
+def grown_surface(
+    surface: SurfaceMap, fix: PoseMeasurement, points, config: TrackerConfig
+) -> SurfaceMap:
     """The surface with what a new keyframe shows of it for the first time."""
     return extend_surface(surface, own_coordinates(fix, points), fix.labels, config.registration)
 
 
 def rebased_surface(
-    surface: Surface, tracked: Fix, fix: Fix, anew, config: TrackerConfig
-) -> Surface:
+    surface: SurfaceMap, tracked: PoseMeasurement, fix: PoseMeasurement, anew, config: TrackerConfig
+) -> SurfaceMap:
     """The surface where it was in the camera's frame, said in corrected part frames.
 
     Nothing is kept where it begins ``anew``: an estimate that replaces the track says that its
@@ -210,9 +229,9 @@ def rebased_surface(
     """
     old, new = (se3.compose(f.root, f.parts) for f in (tracked, fix))
     moved = move_surface(surface, se3.compose(se3.inverse(new), old))
-    return select(anew, empty_surface(config.registration), moved)
+    return tree_where(anew, empty_surface(config.registration), moved)
 
 
-def select(condition, yes, no):
+def tree_where(condition, yes, no):
     """``where`` for whole pytrees."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

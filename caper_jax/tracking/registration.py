@@ -5,7 +5,7 @@ or two; the clouds themselves say it to a tenth of that. The clouds of keyframes
 hundred Gaussians (local mean and covariance, so that noise averages out and normals need no
 search), each in the frame of its part; a later keyframe adds only what was not seen before, so that
 what was seen first stays where it was. Every point of a new cloud is matched with the nearest
-Gaussian, and Gauss-Newton steps on the root's twist and the joint states minimise the robust
+Gaussian, and Gauss-Newton steps on the root's twist and the joint states minimize the robust
 Mahalanobis distances. All of it is differentiable but the choice of matches.
 
 Lengths are network units; a joint's state is radians or network units.
@@ -14,7 +14,7 @@ Lengths are network units; a joint's state is radians or network units.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import flax.struct
@@ -23,63 +23,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from caper_jax.articulation.joints import joint_transforms
-from caper_jax.errors import CaperError
-from caper_jax.geometry import linalg, se3
-from caper_jax.networks.graph import gather, smallest, squared_distances
+from caper_jax.config import RegistrationConfig
+from caper_jax.lie import linalg, se3
+from caper_jax.models.encoders.neighbors import gather, smallest, squared_distances
 
 _NOWHERE = 1e3  # where Gaussians lie that are none
 
 
-@dataclass(frozen=True)
-class RegistrationConfig:
-    """How a cloud is registered; lengths in network units (objects are about 2 across).
-
-    Attributes:
-      steps: Gauss-Newton steps per frame, each with new matches; 0 leaves the network's increment.
-      gaussians: number of Gaussians of one keyframe.
-      capacity: largest number of Gaussians kept; the oldest give way.
-      stride: every so-manieth point of a cloud is registered.
-      window: standard deviation of the window around each of them.
-      noise: standard deviation added to their covariance: sensor and shape.
-      robust: Mahalanobis distance at which a match counts a quarter.
-      wrong_part: distance that a match across two parts must be closer by: labels may be wrong.
-      share: weight of a match; below one, as neighbouring points repeat each other.
-      root_rotation, root_translation, joint: standard deviations of what the prediction misses:
-        radians, units, radians or units.
-      network_rotation, network_translation, network_joint: likewise, of the network's answer.
-      hold: how far a root must seem to move before it moves, as a squared Mahalanobis distance:
-        one that stands still then does not tremble, or drift where little of it is in view.
-    """
-
-    steps: int = 3
-    gaussians: int = 256
-    capacity: int = 512
-    stride: int = 2
-    window: float = 0.08
-    noise: float = 0.01
-    robust: float = 3.0
-    wrong_part: float = 0.1
-    share: float = 0.25
-    root_rotation: float = 0.1
-    root_translation: float = 0.1
-    joint: float = 0.2
-    network_rotation: float = 0.05
-    network_translation: float = 0.05
-    network_joint: float = 0.05
-    hold: float = 30.0
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.gaussians <= self.capacity:
-            raise CaperError(
-                f"registration.gaussians = {self.gaussians} must be 1 or more, and at most "
-                f"registration.capacity = {self.capacity}"
-            )
-        if self.steps < 0 or self.stride < 1:
-            raise CaperError("registration.steps must be 0 or more, registration.stride 1 or more")
-
-
 @flax.struct.dataclass
-class Surface:
+class SurfaceMap:
     """Gaussians on the parts' surfaces, each in the frame of its part.
 
     Attributes:
@@ -96,7 +48,7 @@ class Surface:
 
 
 @flax.struct.dataclass
-class Tree:
+class JointTree:
     """The joints of an object, in the root's canonical frame.
 
     Attributes:
@@ -121,7 +73,7 @@ class PartPoses:
       poses: [K, 4, 4] part poses in the root's frame there.
     """
 
-    tree: Tree
+    tree: JointTree
     state: Any
     poses: Any
 
@@ -131,7 +83,7 @@ class PartPoses:
         return se3.compose(se3.compose(after, se3.inverse(before)), self.poses)
 
 
-def part_poses(tree: Tree, state):
+def part_poses(tree: JointTree, state):
     """[K, 4, 4] poses of the parts in the root's frame."""
     moves = joint_transforms(tree.types, tree.axis, tree.pivot, state)
     poses = [jnp.eye(4, dtype=moves.dtype)]
@@ -140,10 +92,10 @@ def part_poses(tree: Tree, state):
     return jnp.stack(poses)
 
 
-def empty_surface(config: RegistrationConfig) -> Surface:
+def empty_surface(config: RegistrationConfig) -> SurfaceMap:
     """No Gaussians."""
     size = config.capacity
-    return Surface(
+    return SurfaceMap(
         mean=jnp.full((size, 3), _NOWHERE),
         information=jnp.tile(jnp.eye(3), (size, 1, 1)),
         labels=jnp.zeros(size, jnp.int32),
@@ -151,7 +103,7 @@ def empty_surface(config: RegistrationConfig) -> Surface:
     )
 
 
-def extend_surface(surface: Surface, points, labels, config: RegistrationConfig) -> Surface:
+def extend_surface(surface: SurfaceMap, points, labels, config: RegistrationConfig) -> SurfaceMap:
     """A surface with what a cloud shows of it for the first time.
 
     Args:
@@ -179,7 +131,7 @@ def extend_surface(surface: Surface, points, labels, config: RegistrationConfig)
     new = known > config.window**2
     rank = jnp.cumsum(new) - 1
     at = jnp.where(new, (surface.added + rank) % config.capacity, config.capacity)
-    return Surface(
+    return SurfaceMap(
         mean=surface.mean.at[at].set(mean, mode="drop"),
         information=surface.information.at[at].set(_across(_inverse(covariance)), mode="drop"),
         labels=surface.labels.at[at].set(kinds, mode="drop"),
@@ -187,7 +139,7 @@ def extend_surface(surface: Surface, points, labels, config: RegistrationConfig)
     )
 
 
-def move_surface(surface: Surface, motions) -> Surface:
+def move_surface(surface: SurfaceMap, motions) -> SurfaceMap:
     """The surface after a change of the parts' frames: [K, 4, 4], old frame -> new frame."""
     motion = motions[surface.labels]
     turn = motion[:, :3, :3]
@@ -199,7 +151,7 @@ def move_surface(surface: Surface, motions) -> Surface:
 
 
 def register(
-    surface: Surface,
+    surface: SurfaceMap,
     parts: PartPoses,
     points,
     labels,
@@ -226,7 +178,7 @@ def register(
 
     def gauss_newton(pose, _):
         root, state = pose
-        residual, jacobian, weight, matrix = _linearise(
+        residual, jacobian, weight, matrix = _linearize(
             surface, parts, points, labels, root, state, config
         )
         weighted = jnp.einsum("nab,nbd->nad", matrix, jacobian, precision="highest")
@@ -248,7 +200,7 @@ def register(
     return root, state, information[-1]
 
 
-def hold_still(before, root, information, threshold: float):
+def suppress_jitter(before, root, information, threshold: float):
     """A root pose drawn back to the one before, as far as the motion is within its uncertainty.
 
     The positive-part James-Stein estimate of the motion: zero up to the threshold, all of it far
@@ -257,7 +209,7 @@ def hold_still(before, root, information, threshold: float):
     Args:
       before: [4, 4] root pose of the last frame.
       root: [4, 4] of this frame.
-      information: [6 + J, 6 + J] from ``register``; joint states are marginalised out.
+      information: [6 + J, 6 + J] from ``register``; joint states are marginalized out.
       threshold: squared Mahalanobis distance.
     """
     xi = se3.log(se3.compose(se3.inverse(before), root))
@@ -270,7 +222,9 @@ def hold_still(before, root, information, threshold: float):
     return se3.compose(before, se3.exp(share * xi))
 
 
-def mismatch(surface: Surface, parts: PartPoses, points, labels, pose, config: RegistrationConfig):
+def match_cost(
+    surface: SurfaceMap, parts: PartPoses, points, labels, pose, config: RegistrationConfig
+):
     """Mean robust distance [] of a cloud from the surface, in [0, 1]: 1 is no match.
 
     Args as for ``register``; ``pose`` is (root [4, 4], joint states [J]).
@@ -299,7 +253,7 @@ def _residuals(surface, parts, points, labels, root, state, config):
     return residual, matrix, here, at
 
 
-def _linearise(surface, parts, points, labels, root, state, config):
+def _linearize(surface, parts, points, labels, root, state, config):
     """Residuals [N, 3], their Jacobian [N, 3, 6 + J], robust weights [N], information."""
     residual, matrix, here, at = _residuals(surface, parts, points, labels, root, state, config)
     squared = (residual * linalg.apply(matrix, residual)).sum(-1)
@@ -325,7 +279,7 @@ def _linearise(surface, parts, points, labels, root, state, config):
     return residual, jnp.concatenate(columns, -1), weight, matrix
 
 
-def _moved_joints(tree: Tree, state):
+def _moved_joints(tree: JointTree, state):
     """Axes and pivots [J, 3] where the joints stand at a state, in the root's frame."""
     poses = part_poses(tree, state)[np.array(tree.parents, int)]
     axis = linalg.apply(poses[:, :3, :3], tree.axis)

@@ -8,7 +8,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from caper_jax.tracking.registration import Surface
+from caper_jax.tracking.registration import SurfaceMap
 
 
 @flax.struct.dataclass
@@ -16,7 +16,7 @@ class Observation:
     """One frame of a stream.
 
     Attributes:
-      points: [N, 3] metres, camera frame; anything where ``present`` is false.
+      points: [N, 3] meters, camera frame; anything where ``present`` is false.
       present: [] bool, whether the frame shows the object at all.
       labels: [N] int32 part of each point where it is known, -1 where the tracker is to predict it.
     """
@@ -27,7 +27,7 @@ class Observation:
 
 
 @flax.struct.dataclass
-class Constants:
+class ObjectParameters:
     """What stays the same throughout a video; network units, root's canonical frame.
 
     Attributes:
@@ -81,9 +81,9 @@ class TrackerState:
         drifted from what the static estimator or the user gave.
       keyframe: what increments refer to.
       surface: what was seen of the parts so far, for registration.
-      accepted: [] the misfit that the static estimator was asked about and could not better, so
-        that objects of unusual size are not doubted again and again.
-      doubtful: [] int32, frames in a row that disagreed with the track.
+      accepted: [] the box residual that the static estimator was asked about and could not
+        better, so that objects of unusual size are not doubted again and again.
+      num_inconsistent: [] int32, frames in a row that disagreed with the track.
       turn: [24] log odds, over the frames so far, that the track is off by a turn, as stage II sees
         it.
       vote: [24] likewise, by static estimates on trial.
@@ -96,12 +96,12 @@ class TrackerState:
     parts: Any
     root_velocity: Any
     joint_velocity: Any
-    constants: Constants
+    constants: ObjectParameters
     variance: Any
     keyframe: Keyframe
-    surface: Surface
+    surface: SurfaceMap
     accepted: Any
-    doubtful: Any
+    num_inconsistent: Any
     turn: Any
     vote: Any
     trial: Any

@@ -12,48 +12,52 @@ import jax.numpy as jnp
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.geometry import se3
-from caper_jax.networks.caper import NetworkConfig
-from caper_jax.networks.turns import NUM_TURNS
-from caper_jax.reading import SMALLEST_SIZE
-from caper_jax.tracking.config import TrackerConfig
+from caper_jax.config import NetworkConfig, RegistrationConfig, TrackerConfig
+from caper_jax.lie import se3
+from caper_jax.models.pipeline import SMALLEST_SIZE
+from caper_jax.models.rotation_classes import NUM_CUBE_ROTATIONS
 from caper_jax.tracking.energy import chamfer_energy
-from caper_jax.tracking.fix import Fix, averaged, diagonal, measure, misfit
 from caper_jax.tracking.joints import joints_from_poses
 from caper_jax.tracking.keyframes import (
     added,
-    contradicts,
     corrected,
     grown_surface,
-    is_due,
+    is_keyframe,
     make_keyframe,
     moved_cloud,
+    poses_disagree,
     rebased_surface,
-    select,
+    tree_where,
+)
+from caper_jax.tracking.measurement import (
+    PoseMeasurement,
+    averaged,
+    box_residual,
+    diagonal,
+    measure,
 )
 from caper_jax.tracking.registration import (
+    JointTree,
     PartPoses,
-    RegistrationConfig,
-    Surface,
-    Tree,
+    SurfaceMap,
     empty_surface,
-    hold_still,
-    mismatch,
+    match_cost,
     register,
+    suppress_jitter,
 )
-from caper_jax.tracking.state import Constants, Keyframe, Observation, TrackerState, of_type
+from caper_jax.tracking.state import Keyframe, ObjectParameters, Observation, TrackerState, of_type
 
-_ACCEPTED = 1.3  # how much worse than an accepted misfit contradicts again
+_ACCEPTED = 1.3  # how much worse than an accepted box_residual poses_disagree again
 _GIVEN = 60.0  # nats against a turn of a pose that the user gave
 _ENERGY_STRIDE = 2  # every so-manieth point enters the energy
 
 
 @flax.struct.dataclass
-class Tracked:
+class TrackResult:
     """What the tracker says about one frame.
 
     Attributes:
-      pose: ArticulatedPose [K, ...], metres, camera frame.
+      pose: ArticulatedPose [K, ...], meters, camera frame.
       labels: [N] int32 part of each point.
       energy: [] Eq 16, relative to the object's diagonal.
       keyframe: [] bool, whether this frame became the keyframe.
@@ -74,7 +78,7 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
     """The state before the first frame: the static estimator gives that frame's pose."""
     parts, joints, points = category.num_parts, category.num_joints, network.num_points
     eye = jnp.eye(4)
-    constants = Constants(
+    constants = ObjectParameters(
         axis=jnp.tile(jnp.array([1.0, 0.0, 0.0]), (joints, 1)),
         pivot=jnp.zeros((joints, 3)),
         size=jnp.asarray(category.mean_size) * category.unit,
@@ -101,9 +105,9 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
         keyframe=keyframe,
         surface=empty_surface(config.registration),
         accepted=jnp.zeros(()),
-        doubtful=jnp.asarray(0, jnp.int32),
-        turn=jnp.zeros(NUM_TURNS),
-        vote=jnp.zeros(NUM_TURNS),
+        num_inconsistent=jnp.asarray(0, jnp.int32),
+        turn=jnp.zeros(NUM_CUBE_ROTATIONS),
+        vote=jnp.zeros(NUM_CUBE_ROTATIONS),
         trial=jnp.asarray(0, jnp.int32),
         lost=jnp.asarray(True),
     )
@@ -128,7 +132,7 @@ def given_state(
       variables: as ``estimator.estimate`` takes them.
       frame: the first frame.
       rotation: [K, 3, 3] part frame -> camera.
-      translation: [K, 3] metres.
+      translation: [K, 3] meters.
       category, network, config: static.
     """
     poses = se3.from_rt(rotation, translation * category.unit)
@@ -160,7 +164,7 @@ def track_step(
     category: Category,
     network: NetworkConfig,
     config: TrackerConfig,
-) -> tuple[TrackerState, Tracked]:
+) -> tuple[TrackerState, TrackResult]:
     """Tracks the object through one frame.
 
     Pure, of fixed shapes, without batch axes: jit it and call it in a loop, scan it over a
@@ -190,7 +194,7 @@ def _track_step(
     category: Category,
     network: NetworkConfig,
     config: TrackerConfig,
-) -> tuple[TrackerState, Tracked]:
+) -> tuple[TrackerState, TrackResult]:
     key = state.keyframe
     # A frame without points runs through the same arithmetic, on points where the object was.
     stand_in = se3.act(state.root, key.points) + jnp.array([0.0, 0.0, 1e-3])
@@ -200,10 +204,10 @@ def _track_step(
         se3.compose(state.root, se3.exp(config.damping * state.root_velocity)),
         state.joint_state + config.damping * state.joint_velocity,
     )
-    reference = predicted[0] if config.anchored else key.root
+    reference = predicted[0] if config.use_prediction else key.root
     found = measure(variables, points, frame.labels, reference, category, network)
     constants = averaged(state.constants, found.constants)
-    tree = Tree(constants.axis, constants.pivot, category.joint_types, category.parents)
+    tree = JointTree(constants.axis, constants.pivot, category.joint_types, category.parents)
 
     root, joints = found.root, found.joint_state
     parts = PartPoses(tree, key.joint_state, key.parts)
@@ -213,21 +217,23 @@ def _track_step(
         start = _better_start(against, predicted, (root, joints), config)
         expected = _expectations(config.registration, predicted, (root, joints))
         root, joints, information = register(*against, start, expected, config.registration)
-        root = hold_still(state.root, root, information, config.registration.hold)
-    tracked = Fix(root, joints, parts.at(joints), found.labels, constants, found.sure, found.turn)
+        root = suppress_jitter(state.root, root, information, config.registration.hold)
+    tracked = PoseMeasurement(
+        root, joints, parts.at(joints), found.labels, constants, found.sure, found.turn
+    )
     # Frames show the same object from nearly the same side, so that each counts for little.
     turn = added(state.turn, jnp.clip(found.turn, -1.0, 1.0), config)
-    due_turn = (turn.max() > config.turned) & ~state.lost
+    due_turn = (turn.max() > config.flip_log_odds) & ~state.lost
     turned = jnp.where(due_turn, turn.argmax(), 0).astype(jnp.int32)
 
-    unmatched = mismatch(*against, (root, joints), config.registration)
-    outside = misfit(tracked, points)
+    unmatched = match_cost(*against, (root, joints), config.registration)
+    outside = box_residual(tracked, points)
     contradicted = (
-        (unmatched > config.mismatch)
-        | (outside > jnp.maximum(config.misfit, _ACCEPTED * state.accepted))
-        | contradicts(root, found.root, config)
+        (unmatched > config.max_match_cost)
+        | (outside > jnp.maximum(config.max_box_residual, _ACCEPTED * state.accepted))
+        | poses_disagree(root, found.root, config)
     )
-    doubtful = jnp.where(contradicted, state.doubtful + 1, 0)
+    num_inconsistent = jnp.where(contradicted, state.num_inconsistent + 1, 0)
     energy = chamfer_energy(
         se3.act(se3.inverse(root), points)[::_ENERGY_STRIDE],
         found.labels[::_ENERGY_STRIDE],
@@ -236,7 +242,7 @@ def _track_step(
         category.num_parts,
         diagonal(constants),
     )
-    due = is_due(energy, unmatched, key.age, config) | (state.trial > 0)
+    due = is_keyframe(energy, unmatched, key.age, config) | (state.trial > 0)
     correction = corrected(
         variables,
         points,
@@ -245,7 +251,7 @@ def _track_step(
         outside,
         state,
         due,
-        doubtful,
+        num_inconsistent,
         turned,
         category,
         network,
@@ -254,7 +260,7 @@ def _track_step(
     fix, sure, replaced = correction.fix, correction.sure, correction.replaced
     due |= replaced
     # One that is unsure is asked again in the next frame.
-    settled = (doubtful >= config.patience) & sure
+    settled = (num_inconsistent >= config.patience) & sure
     left = jnp.maximum(state.trial - sure, 0)
     # Without keyframes a frame knows of the last one only.
     anew = replaced | (config.policy == "none")
@@ -278,16 +284,18 @@ def _track_step(
         joint_velocity=jnp.where(replaced, 0.0, joint_velocity),
         constants=fix.constants,
         variance=correction.variance,
-        keyframe=select(due, make_keyframe(fix, points), replace(key, age=key.age + 1)),
+        keyframe=tree_where(due, make_keyframe(fix, points), replace(key, age=key.age + 1)),
         surface=surface,
         accepted=jnp.where(
             replaced, 0.0, jnp.where(settled, jnp.maximum(outside, state.accepted), state.accepted)
         ),
         # A pose from the static estimator alone is on trial: one contradiction undoes it.
-        doubtful=jnp.where(replaced, config.patience - 1, jnp.where(settled, 0, doubtful)),
+        num_inconsistent=jnp.where(
+            replaced, config.patience - 1, jnp.where(settled, 0, num_inconsistent)
+        ),
         turn=jnp.where(replaced, 0.0, turn),
         vote=jnp.where(replaced, 0.0, correction.vote),
-        trial=jnp.where(replaced, config.trial, left).astype(jnp.int32),
+        trial=jnp.where(replaced, config.init_frames, left).astype(jnp.int32),
         lost=jnp.asarray(False),
     )
     held = replace(
@@ -297,8 +305,8 @@ def _track_step(
     )
     # Numbers that overflowed on the way would stay for good.
     usable = frame.present & _finite(after)
-    after = select(usable, after, held)
-    return after, Tracked(
+    after = tree_where(usable, after, held)
+    return after, TrackResult(
         pose=_articulated_pose(after, category),
         labels=fix.labels,
         energy=energy,
@@ -325,15 +333,15 @@ def _expectations(config: RegistrationConfig, predicted, found):
 
 
 def _better_start(
-    against: tuple[Surface, PartPoses, Any, Any], predicted, found, config: TrackerConfig
+    against: tuple[SurfaceMap, PartPoses, Any, Any], predicted, found, config: TrackerConfig
 ):
     """The prediction or the network's answer, whichever lies closer to the keyframe's surface."""
-    costs = [mismatch(*against, start, config.registration) for start in (predicted, found)]
-    return select(costs[1] < costs[0], found, predicted)
+    costs = [match_cost(*against, start, config.registration) for start in (predicted, found)]
+    return tree_where(costs[1] < costs[0], found, predicted)
 
 
 def _articulated_pose(state: TrackerState, category: Category) -> ArticulatedPose:
-    """The pose in metres."""
+    """The pose in meters."""
     unit = category.unit
     poses = se3.compose(state.root, state.parts)
     return ArticulatedPose(

@@ -1,1 +1,1 @@
-"""Training: optimiser, state, loop, checkpoints, parallelism and export of models."""
+"""Training: optimizer, state, loop, checkpoints, parallelism and export of models."""

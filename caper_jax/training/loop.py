@@ -10,100 +10,23 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import numpy as np
 
-from caper_jax.errors import CaperError, check_least
+from caper_jax.config import TrainingConfig
+from caper_jax.errors import CaperError
 from caper_jax.progress import progress as progress_display
 from caper_jax.training import parallel
 from caper_jax.training.checkpoints import Checkpoints
 from caper_jax.training.metrics_log import FILE, MetricsLog
-from caper_jax.training.optimizer import Optimizer, OptimizerName, flat_and_anneal
+from caper_jax.training.optimizer import flat_and_anneal, optimizer_of
 from caper_jax.training.run_directory import check_configuration
 from caper_jax.training.signals import StopRequest
-from caper_jax.training.state import BatchNormExtent, LossFn, TrainState, make_step
+from caper_jax.training.step import LossFn, TrainState, make_step
 
 PyTree = Any
-
-
-@dataclass(frozen=True)
-class TrainingConfig:
-    """How to train; a run is bounded by ``steps`` or by ``minutes``, exactly one of them.
-
-    Attributes:
-      batch_size: samples per step over all devices.
-      learning_rate: base rate; see `flat_and_anneal` for its course.
-      optimizer: "ranger" or "adamw".
-      warmup: steps of linear warm-up.
-      clip_norm: bound on the global norm of the gradient.
-      weight_decay: decoupled weight decay.
-      steps: length of the run in steps; the result is then a function of the seed.
-      minutes: length of the run in minutes of training, summed over resumes; compiling the step
-        does not count.
-      seed: every random number of the run follows from it.
-      steps_per_dispatch: steps compiled into one call, to hide the cost of calling.
-      log_steps: steps averaged into one line of metrics.jsonl.
-      checkpoint_minutes: time between checkpoints.
-      checkpoint_steps: steps between checkpoints, besides those by time; 0 for none.
-      keep_checkpoints: newest checkpoints to keep.
-      max_bad_steps: stop after so many steps without a finite gradient in a row.
-      batch_norm: over several devices: "global", as one device would train with the whole batch,
-        or "local", each on its own rows, which needs one sum per step (see `make_step`).
-    """
-
-    ALTERNATIVES: ClassVar = ("steps", "minutes")
-
-    batch_size: int = 16
-    learning_rate: float = 1e-4
-    optimizer: OptimizerName = "ranger"
-    warmup: int = 1000
-    clip_norm: float = 5.0
-    weight_decay: float = 0.0
-    steps: int | None = None
-    minutes: float | None = None
-    seed: int = 0
-    steps_per_dispatch: int = 1
-    log_steps: int = 50
-    checkpoint_minutes: float = 5.0
-    checkpoint_steps: int = 0
-    keep_checkpoints: int = 3
-    max_bad_steps: int = 50
-    batch_norm: BatchNormExtent = "global"
-
-    def __post_init__(self) -> None:
-        if (self.steps is None) == (self.minutes is None):
-            raise CaperError(
-                f"training needs either steps or minutes, got steps={self.steps}, "
-                f"minutes={self.minutes}"
-            )
-        check_least(
-            "training",
-            self,
-            batch_size=1,
-            steps_per_dispatch=1,
-            log_steps=1,
-            keep_checkpoints=1,
-            max_bad_steps=1,
-            warmup=0,
-            checkpoint_steps=0,
-        )
-        for name in ("steps", "minutes", "checkpoint_minutes"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise CaperError(f"training.{name} must be positive, got {value}")
-        if self.batch_norm not in ("global", "local"):
-            raise CaperError(
-                f"training.batch_norm must be 'global' or 'local', got {self.batch_norm!r}"
-            )
-        if not 0 <= self.seed < 2**32:
-            raise CaperError(f"training.seed must be in 0..2**32 - 1, got {self.seed}")
-        self.build_optimizer()  # checks its settings
-
-    def build_optimizer(self) -> Optimizer:
-        """The optimiser these settings describe."""
-        return Optimizer(self.optimizer, self.learning_rate, self.clip_norm, self.weight_decay)
 
 
 @dataclass(frozen=True)
@@ -149,7 +72,7 @@ def fit(
         gives its own rows; a function of the step, so that a resumed run sees the same data.
       mesh: devices to split the batch over; one device without it.
       description: what else defines the run (network, data); kept in config.json and compared
-        on resume. Must be JSON-serialisable.
+        on resume. Must be JSON-serializable.
 
     Raises:
       CaperError: the directory holds a run of another configuration or cannot be read, a
@@ -165,7 +88,7 @@ def fit(
     directory = Path(directory)
     check_configuration(directory, {"training": dataclasses.asdict(config), **(description or {})})
 
-    optimizer = config.build_optimizer()
+    optimizer = optimizer_of(config)
     step_fn = make_step(
         loss_fn, optimizer, batch_fn=batch_fn, mesh=mesh, batch_norm=config.batch_norm
     )

@@ -6,40 +6,10 @@ an ambiguous object can be chosen per sample; the step takes the mean.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
 import jax
 import jax.numpy as jnp
 
-from caper_jax.errors import check_least
-
-HeatmapKind = Literal["exponential", "scaled", "linear"]
-
-
-@dataclass(frozen=True)
-class LossWeights:
-    """Weights of Eqs 22 and 23 as the paper gives them, and of the two dense joint targets.
-
-    ``heatmap`` and ``offset`` supervise Eqs 4 and 5, which the paper defines but does not weigh;
-    ``turn`` is ours (see ``networks.turns``).
-    """
-
-    rotation: float = 8.0
-    translation: float = 10.0
-    confidence: float = 1.0
-    location: float = 1.0
-    direction: float = 1.0
-    state: float = 6.0
-    scale: float = 1.0
-    segmentation: float = 0.1
-    twist: float = 1.0
-    heatmap: float = 1.0
-    offset: float = 1.0
-    turn: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_least("loss.weights", self, **dict.fromkeys(self.__dataclass_fields__, 0))
+from caper_jax.config import HeatmapKind, LossWeights
 
 
 def _per_sample(values):
@@ -163,7 +133,7 @@ def state_loss(state, true_state, penalty: float = 20.0):
 
 
 def scale_loss(size, true_size):
-    """Mean absolute difference of part sizes (or box centres), [B, K, 3] -> [B]."""
+    """Mean absolute difference of part sizes (or box centers), [B, K, 3] -> [B]."""
     return _per_sample(jnp.abs(size - true_size))
 
 
@@ -184,7 +154,7 @@ def twist_loss(twist, true_twist):
     return error[..., :-3].mean(-1) + error[..., -3:].mean(-1)
 
 
-def turn_loss(logits, turn):
+def rotation_class_loss(logits, turn):
     """Cross entropy of the whole turn that the reference is off by, [B, 24] and [B] -> [B]."""
     return -jnp.take_along_axis(jax.nn.log_softmax(logits), turn[:, None], axis=-1)[:, 0]
 

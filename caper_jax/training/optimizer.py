@@ -1,7 +1,7 @@
-"""Optimisers and the flat-and-anneal schedule (Ranger, as used to train HS-Pose).
+"""Optimizers and the flat-and-anneal schedule (Ranger, as used to train HS-Pose).
 
-Ranger is RAdam (Liu et al. 2020) on centralised gradients (Yong et al. 2020) inside Lookahead
-(Zhang et al. 2019). The optimiser state does not depend on the learning rate, which is why the
+Ranger is RAdam (Liu et al. 2020) on centralized gradients (Yong et al. 2020) inside Lookahead
+(Zhang et al. 2019). The optimizer state does not depend on the learning rate, which is why the
 builders below take the rate of *this* step, possibly a traced scalar: one compiled step serves a
 run bounded by steps and a run bounded by minutes.
 """
@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 
+from caper_jax.config import OptimizerName, TrainingConfig
 from caper_jax.errors import CaperError, unknown_name
 
 PyTree = Any
-OptimizerName = Literal["ranger", "adamw"]
 OPTIMIZERS: tuple[OptimizerName, ...] = ("ranger", "adamw")
 
 _FLAT_UNTIL = 0.72  # progress at which the cosine begins
@@ -74,21 +74,21 @@ def ranger(
     sync_period: int = 6,
     slow_step_size: float = 0.5,
 ) -> optax.GradientTransformation:
-    """Ranger: global-norm clipping, gradient centralisation, RAdam, Lookahead.
+    """Ranger: global-norm clipping, gradient centralization, RAdam, Lookahead.
 
     Works on ``optax.LookaheadParams``: gradients are taken at ``fast``, ``slow`` is what to
     evaluate and to ship. ``eps`` is added to the bias-corrected root of the second moment.
 
     Args:
       learning_rate: rate of this step; may be traced, the state does not depend on it.
-      clip_norm: bound on the global norm of the gradient, before centralisation.
+      clip_norm: bound on the global norm of the gradient, before centralization.
       b1: decay of the first moment.
       b2: decay of the second moment.
       eps: added to the denominator.
       threshold: length of the approximated moving average from which RAdam rectifies; below it
         the step is plain momentum.
       weight_decay: decoupled weight decay.
-      sync_period: fast steps between two synchronisations (k).
+      sync_period: fast steps between two synchronizations (k).
       slow_step_size: step of the slow weights towards the fast ones (alpha).
     """
     fast = optax.chain(
@@ -123,7 +123,7 @@ def adamw(
 
 @dataclass(frozen=True)
 class Optimizer:
-    """One interface to Ranger and AdamW: initialise, then update with the factor of the step.
+    """One interface to Ranger and AdamW: initialize, then update with the factor of the step.
 
     Attributes:
       name: "ranger" or "adamw".
@@ -156,7 +156,7 @@ class Optimizer:
         )
 
     def init(self, params: PyTree) -> tuple[PyTree, PyTree]:
-        """Wrap the parameters as this optimiser keeps them, and make its state.
+        """Wrap the parameters as this optimizer keeps them, and make its state.
 
         Args:
           params: the network's parameters.
@@ -176,12 +176,12 @@ class Optimizer:
 
         Args:
           gradients: of the loss at ``training_weights(params)``, same structure.
-          state: optimiser state.
+          state: optimizer state.
           params: as returned by `init`.
           factor: the schedule's factor of this step; may be traced.
 
         Returns:
-          (new params, new optimiser state).
+          (new params, new optimizer state).
         """
         updates, state = self._transformation(factor).update(gradients, state, params)
         return optax.apply_updates(params, updates), state
@@ -195,3 +195,8 @@ def training_weights(params: PyTree) -> PyTree:
 def evaluation_weights(params: PyTree) -> PyTree:
     """The weights to evaluate and to export (the slow ones under Lookahead)."""
     return params.slow if isinstance(params, optax.LookaheadParams) else params
+
+
+def optimizer_of(config: TrainingConfig) -> Optimizer:
+    """The optimizer that a run's settings describe."""
+    return Optimizer(config.optimizer, config.learning_rate, config.clip_norm, config.weight_decay)

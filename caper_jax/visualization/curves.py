@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from caper_jax.evaluation.tables.render import Curves, Scatter
+from caper_jax.reproduce.render import Curves, Scatter
 from caper_jax.visualization.figures import save_figure
 
 _SIZE, _DPI = (8.0, 4.5), 120
@@ -53,7 +53,7 @@ def training_curves(title: str, rows: Sequence[dict[str, Any]]) -> Curves:
 
 
 def write_scatter(path: Path, scatter: Scatter) -> None:
-    """Writes a PNG with one panel of points per label, equal axes and one colour bar.
+    """Writes a PNG with one panel of points per label, equal axes and one color bar.
 
     Args:
       path: the file; its folder exists.
@@ -66,12 +66,12 @@ def write_scatter(path: Path, scatter: Scatter) -> None:
     every = np.abs(np.concatenate([np.concatenate(p) for p in scatter.panels.values()]))
     reach = max(float(np.quantile(every, 0.98)), 1e-3)
     for axes, (label, values) in zip(panels, scatter.panels.items(), strict=True):
-        x, y, colour = (np.clip(v, -reach, reach) for v in values)
-        drawn = axes.scatter(x, y, c=colour, s=5, cmap="coolwarm", vmin=-reach, vmax=reach)
+        x, y, color = (np.clip(v, -reach, reach) for v in values)
+        drawn = axes.scatter(x, y, c=color, s=5, cmap="coolwarm", vmin=-reach, vmax=reach)
         axes.set(title=label, xlabel=scatter.x_label, ylabel=scatter.y_label)
         axes.set(xlim=(-1.05 * reach, 1.05 * reach), ylim=(-1.05 * reach, 1.05 * reach))
         axes.set_aspect("equal")
         axes.grid(alpha=0.3)
-    figure.colorbar(drawn, ax=panels, label=scatter.colour_label, shrink=0.8)
+    figure.colorbar(drawn, ax=panels, label=scatter.color_label, shrink=0.8)
     figure.suptitle(scatter.title)
     save_figure(figure, path)

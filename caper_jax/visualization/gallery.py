@@ -13,9 +13,9 @@ import numpy as np
 from matplotlib.colors import to_rgb
 
 from caper_jax.articulation.category import Category
-from caper_jax.data.synthetic.bank import build_bank, draw_models
-from caper_jax.data.synthetic.caster import cast, projected_bounds
-from caper_jax.data.synthetic.scene import draw_state_and_poses
+from caper_jax.synthetic.frames import draw_state_and_poses
+from caper_jax.synthetic.instances import build_bank, draw_instances
+from caper_jax.synthetic.ray_casting import cast, projected_bounds
 from caper_jax.visualization.figures import save_figure
 from caper_jax.visualization.scene import part_color
 
@@ -39,7 +39,7 @@ def write_gallery(
       path: the file.
       categories: the rows.
       count: instances per row, each in a random state before a random camera of the category.
-      split, seed: as for ``draw_models``.
+      split, seed: as for ``draw_instances``.
 
     Raises:
       CaperError: a category without procedural shapes.
@@ -69,8 +69,8 @@ def _parts(category: Category) -> list[str]:
 
 
 def render_instances(category: Category, count: int, split: str, seed: int) -> np.ndarray:
-    """Shaded images [count, TILE, TILE, 3] in [0, 1] of different instances, parts coloured."""
-    bank = build_bank(draw_models(category, count, split, seed))
+    """Shaded images [count, TILE, TILE, 3] in [0, 1] of different instances, parts colored."""
+    bank = build_bank(draw_instances(category, count, split, seed))
     # The name enters the key: other cameras for other categories.
     key = jax.random.fold_in(jax.random.key(seed), zlib.crc32(category.name.encode()))
     keys = jax.random.split(key, count)

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from caper_jax.data.urdf.canonical import ImportedObject
-from caper_jax.data.urdf.render import PartCaster
+from caper_jax.synthetic.urdf_frames import PartCaster
 from caper_jax.visualization.figures import save_figure
 from caper_jax.visualization.scene import part_color
 
@@ -30,7 +30,7 @@ OPENED = 0.8  # of the range, in the last view
 def write_model_check(path: str | Path, item: ImportedObject) -> Path:
     """Draws an object at rest from three sides, and opened from the front left above.
 
-    Parts are coloured as everywhere; arrows x, y, z are the canonical axes at the origin, black
+    Parts are colored as everywhere; arrows x, y, z are the canonical axes at the origin, black
     arrows the joints: a positive state turns right-handed about them, or slides along.
 
     Args:

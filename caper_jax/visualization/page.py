@@ -81,7 +81,7 @@ def write_page(path: str | Path, scenes: Sequence[Scene], title: str = "caper_ja
 
 
 def _scene_data(scene: Scene) -> dict[str, Any]:
-    """What the page's script needs of a scene; camera frame, metres, radians."""
+    """What the page's script needs of a scene; camera frame, meters, radians."""
     category = scene.category
     order = np.argsort(scene.labels, kind="stable")
     points = np.asarray(scene.points)[order].astype("<f4")
@@ -158,5 +158,5 @@ def _image_address(scene: Scene, depth: np.ndarray) -> str:
 
 
 def _rounded(values: Any) -> list[Any]:
-    """Nested lists, to a micrometre or a microradian."""
+    """Nested lists, to a micrometer or a microradian."""
     return np.round(np.asarray(values, float), 6).tolist()

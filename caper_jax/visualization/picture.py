@@ -46,7 +46,7 @@ Projection = Callable[[np.ndarray], np.ndarray]
 def write_picture(path: str | Path, scenes: Sequence[Scene]) -> Path:
     """Draws a row per scene: depth image, estimate over it, another side, sizes and states.
 
-    Boxes and points carry the colour of their part; edges behind the box are thin and dotted, the
+    Boxes and points carry the color of their part; edges behind the box are thin and dotted, the
     truth thin and dashed, joint axes black arrows about which a positive state turns.
 
     Args:
@@ -202,11 +202,11 @@ def _draw_joints(
 
 
 def _draw_legend(axes: Axes, scene: Scene) -> None:
-    """Names, sizes and states as text beside the colours and line styles they belong to."""
+    """Names, sizes and states as text beside the colors and line styles they belong to."""
     axes.set_axis_off()
     axes.set_xlim(0, 1)
     category, pose, truth = scene.category, scene.pose, scene.truth
-    rows: list[tuple[str, str, str]] = []  # (kind, colour or nothing, text)
+    rows: list[tuple[str, str, str]] = []  # (kind, color or nothing, text)
     for part, name in enumerate(category.parts):
         size = " × ".join(f"{100 * extent:.1f}" for extent in np.asarray(pose.size)[part])
         rows.append(("part", part_color(part), f"{name}   {size} cm"))
@@ -234,7 +234,7 @@ def _draw_legend(axes: Axes, scene: Scene) -> None:
 
 
 def _draw_scale(axes: Axes) -> None:
-    """A bar of a round length, in the lower left corner of a view in metres."""
+    """A bar of a round length, in the lower left corner of a view in meters."""
     left, right = axes.get_xlim()
     low, high = axes.get_ylim()
     span = right - left

@@ -1,6 +1,6 @@
 """One frame with its estimate, and the lines that pictures draw of it, as NumPy arrays.
 
-Everything is in the camera's frame (OpenCV: x right, y down, z forward), metres.
+Everything is in the camera's frame (OpenCV: x right, y down, z forward), meters.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import numpy as np
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.schema import pose_shapes
+from caper_jax.data.types import pose_shapes
 from caper_jax.errors import CaperError
 from caper_jax.geometry import boxes
 
-# Okabe and Ito's colours, which colour-blind people can tell apart; yellow, hard to see on white,
+# Okabe and Ito's colors, which color-blind people can tell apart; yellow, hard to see on white,
 # comes last.
 PART_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442")
 
@@ -31,7 +31,7 @@ BOX_EDGES = tuple(
 # Four corners of every face, in turn around it: those with x = -1, x = 1, y = -1, ...
 BOX_FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 
-NEAREST = 1e-3  # metres; what is nearer to the camera's plane has no place in its image
+NEAREST = 1e-3  # meters; what is nearer to the camera's plane has no place in its image
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Scene:
       labels: [N] predicted part of every point, 0 to K - 1.
       pose: the estimate, arrays without batch axes ([K, ...] and [J, ...]).
       truth: ground truth of the same form, if known.
-      depth: [H, W] metres, 0 where there is none, if known.
+      depth: [H, W] meters, 0 where there is none, if known.
       mask: [H, W] bool, the object in ``depth``, if known.
       intrinsics: [3, 3] of ``depth``; needed with it.
 
@@ -96,7 +96,7 @@ class Scene:
 
 
 def part_color(part: int) -> str:
-    """Hex colour of a part; the colours repeat after the last."""
+    """Hex color of a part; the colors repeat after the last."""
     return PART_COLORS[part % len(PART_COLORS)]
 
 
@@ -114,7 +114,7 @@ def joint_lines(pose: ArticulatedPose, category: Category) -> tuple[np.ndarray, 
     pose of the part that a joint is mounted on carries them to the camera, however deep the tree.
 
     Returns:
-      ([J, 3] unit directions, [J, 3] points on the axes, metres).
+      ([J, 3] unit directions, [J, 3] points on the axes, meters).
     """
     parents = list(category.parents)
     rotation = np.asarray(pose.rotation, float)[parents]
@@ -165,7 +165,7 @@ def hidden_edges(corners: np.ndarray, eye: np.ndarray) -> np.ndarray:
 
 
 def project(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Pixels [..., 2] of camera points [..., 3] in front of the camera; pixel centres are whole."""
+    """Pixels [..., 2] of camera points [..., 3] in front of the camera; pixel centers are whole."""
     image = np.asarray(points, float) @ np.asarray(intrinsics, float).T
     return image[..., :2] / image[..., 2:]
 
@@ -194,7 +194,7 @@ def crop_box(scene: Scene, margin: float = 0.12) -> tuple[np.ndarray, np.ndarray
 
 
 def depth_range(scene: Scene) -> tuple[float, float]:
-    """Depths that the colours span: those of the object and half as much again on both sides."""
+    """Depths that the colors span: those of the object and half as much again on both sides."""
     near, far = np.percentile(np.asarray(scene.points)[:, 2], (1, 99))
     reach = max(0.5 * (far - near), 0.01)
     return float(near - reach), float(far + reach)

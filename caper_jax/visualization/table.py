@@ -8,7 +8,7 @@ import numpy as np
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.evaluation.metrics import PoseErrors, pose_errors, pose_errors_up_to_symmetry
 from caper_jax.evaluation.summaries import align
-from caper_jax.geometry import so3
+from caper_jax.lie import so3
 from caper_jax.visualization.scene import Scene, format_state, joint_name
 
 

@@ -128,7 +128,7 @@ def write_states(
 ) -> Path:
     """Draws the joint states and the energy over the frames of a video.
 
-    The truth, where known, is dashed in the colour of its joint; keyframes are vertical lines,
+    The truth, where known, is dashed in the color of its joint; keyframes are vertical lines,
     frames in which the object was lost are shaded.
 
     Args:
@@ -161,7 +161,7 @@ def write_states(
 
 
 def _draw_states(axes: Axes, track: Track, category: Category, kind: str) -> None:
-    """States of all joints of one type, in degrees or centimetres."""
+    """States of all joints of one type, in degrees or centimeters."""
     factor = 180 / np.pi if kind == "revolute" else 100.0
     for joint, joint_type in enumerate(category.joint_types):
         if joint_type != kind:

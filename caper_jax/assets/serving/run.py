@@ -1,4 +1,4 @@
-"""python run.py cloud.npy poses.npz: poses from a cloud [N, 3] or a batch [B, N, 3], in metres.
+"""python run.py cloud.npy poses.npz: poses from a cloud [N, 3] or a batch [B, N, 3], in meters.
 
 Camera frame: x right, y down, z forward. Needs jax and numpy, nothing else. manifest.json says
 what comes out. In a program: ``from run import estimate, sample``."""

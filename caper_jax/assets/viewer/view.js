@@ -34,8 +34,8 @@ class Camera {
 
   // Pixels; the object follows the pointer.
   pan(dx, dy, height) {
-    const metres = 2 * this.distance * Math.tan(FIELD_OF_VIEW / 2) / height;
-    const shift = rotate(transpose(this.rotation), [-dx * metres, dy * metres, 0]);
+    const meters = 2 * this.distance * Math.tan(FIELD_OF_VIEW / 2) / height;
+    const shift = rotate(transpose(this.rotation), [-dx * meters, dy * meters, 0]);
     this.target = add(this.target, shift);
   }
 

@@ -1,6 +1,6 @@
 """From a URDF to an object in this project's frames: rest pose, canonical axes, senses of joints.
 
-The canonical frame has its origin at the centre of the whole object's box at rest. Its axes are
+The canonical frame has its origin at the center of the whole object's box at rest. Its axes are
 those that ``rules`` finds, or that the user names.
 """
 
@@ -41,7 +41,7 @@ class ImportOptions:
       up: [3] the file's direction that becomes canonical y, or None.
       front: [3] the file's direction that becomes canonical z, or None.
       rest: states of the file's joints at rest, by the name of the joint or of the link it
-        carries; degrees or metres. "" stands for all joints that the parts keep.
+        carries; degrees or meters. "" stands for all joints that the parts keep.
       parts: one link of each part in the category's order, or None.
       scale: factor for all lengths, or None for the category's mean size.
     """
@@ -60,9 +60,9 @@ class ImportedObject:
     Attributes:
       name: of the object.
       category: its category.
-      reference: parts and joints at rest, canonical frame, metres; K parts in order.
-      size, box_center: [K, 3] metres.
-      states: [J, 2] range from which states are drawn, radians or metres from rest.
+      reference: parts and joints at rest, canonical frame, meters; K parts in order.
+      size, box_center: [K, 3] meters.
+      states: [J, 2] range from which states are drawn, radians or meters from rest.
       joint_names: J names in the file.
       notes: what was found and decided, for people, a line each.
     """
@@ -145,7 +145,7 @@ def bring(model: UrdfModel, category: Category, options: ImportOptions) -> Impor
 
 
 def _rest_by_joint(model: UrdfModel, rest: Mapping[str, float]) -> dict[str, float]:
-    """Rest states in radians or metres by the joint's name, for the joints that are named."""
+    """Rest states in radians or meters by the joint's name, for the joints that are named."""
     carried = {joint.child: joint for joint in model.joints}
     known = carried | {joint.name: joint for joint in model.joints}
     found = {}
@@ -218,7 +218,7 @@ def _scale(at_rest: Reference, category: Category, scale: float | None) -> tuple
     if scale is None:
         return 1 / ratio, f"size: scaled by {1 / ratio:.4g} to the mean of {category.name}"
     ratio *= scale
-    hint = "" if 0.4 < ratio < 2.5 else "; are its lengths metres? (--scale)"
+    hint = "" if 0.4 < ratio < 2.5 else "; are its lengths meters? (--scale)"
     return scale, f"size: {ratio:.2f} times the mean of {category.name}{hint}"
 
 

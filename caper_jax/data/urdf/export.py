@@ -10,11 +10,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from caper_jax.articulation.category import Category, ObjectModel
-from caper_jax.data.synthetic.bank import centered
 from caper_jax.data.urdf.meshes import NEEDS_MESH
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
 from caper_jax.geometry.solids import Solid
+from caper_jax.synthetic.instances import centered
 
 SECTIONS = 96  # of a circle
 URDF_FILE = "mobility.urdf"  # its name in PartNet-Mobility
@@ -62,7 +62,7 @@ def _shape(solid: Solid, sections: int) -> Any:
 
 
 def part_mesh(solids: list[Solid], sections: int = SECTIONS, united: bool = False) -> Any:
-    """The surface of a part, in metres, in the frame of its solids.
+    """The surface of a part, in meters, in the frame of its solids.
 
     Args:
       solids: at least one.
@@ -105,13 +105,13 @@ def write_urdf(
     """Writes an object as ``mobility.urdf`` with one link, and ``meshes/<part>.obj``, per part.
 
     With all joints at zero the object is in its rest pose, and the frame of the base link is the
-    canonical frame: y up, origin at the centre of the whole object's box at rest (not the z-up
+    canonical frame: y up, origin at the center of the whole object's box at rest (not the z-up
     frame usual in robotics). Every mesh is written in that frame; the frame of another link sits
-    on its joint's pivot with the same axes. URDF counts in metres and radians.
+    on its joint's pivot with the same axes. URDF counts in meters and radians.
 
     Args:
       folder: made if need be.
-      model: the object; it is centred here.
+      model: the object; it is centered here.
       category: names its parts and says how they hang together.
       name: of the robot in the file.
       sections: of a full circle.

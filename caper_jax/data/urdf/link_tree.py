@@ -41,7 +41,7 @@ class LinkTree:
         return found
 
     def diagonal(self, links: Sequence[str]) -> float:
-        """Of the box around links at state 0, metres; 0 without geometry."""
+        """Of the box around links at state 0, meters; 0 without geometry."""
         boxes = [self.boxes[name] for name in links if name in self.boxes]
         if not boxes:
             return 0.0

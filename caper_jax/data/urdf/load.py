@@ -38,7 +38,7 @@ class UrdfJoint:
       parent, child: names of links.
       origin: [4, 4] joint frame -> parent link's frame at state 0.
       axis: [3] unit vector, joint frame.
-      limits: (low, high) radians or metres; infinite where the file gives none.
+      limits: (low, high) radians or meters; infinite where the file gives none.
       remark: why a joint that moves in the file has no state of its own, or "".
       mimic: (name of the joint it follows, multiplier, offset), or None.
     """
@@ -61,7 +61,7 @@ class UrdfJoint:
 
 @dataclass(frozen=True)
 class UrdfModel:
-    """One articulated object as the file gives it; metres.
+    """One articulated object as the file gives it; meters.
 
     Attributes:
       name: of the object: its folder or file.

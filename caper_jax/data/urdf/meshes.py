@@ -21,7 +21,7 @@ class Mesh:
     """A surface.
 
     Attributes:
-      vertices: [V, 3] metres, all in use.
+      vertices: [V, 3] meters, all in use.
       faces: [F, 3] indices of vertices.
     """
 
@@ -98,7 +98,7 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def _collada_unit(text: Any) -> float:
-    """Metres per unit of a Collada file, which trimesh reports as e.g. "0.01 * meters"."""
+    """Meters per unit of a Collada file, which trimesh reports as e.g. "0.01 * meters"."""
     factor, found, _ = str(text or "").partition("* meters")
     return float(factor) if found else 1.0
 
@@ -114,7 +114,7 @@ def _plain(vertices: Any, faces: Any) -> Mesh:
 
 
 def shape_mesh(geometry: Any, where: str) -> Mesh:
-    """A URDF box, cylinder (along z) or sphere, centred on its frame.
+    """A URDF box, cylinder (along z) or sphere, centered on its frame.
 
     Raises:
       CaperError: another shape, or the packages for meshes are not installed.

@@ -16,7 +16,7 @@ _DIRECTIONS = 48  # of a half circle, over which widths are averaged
 
 @dataclass(frozen=True)
 class Reference:
-    """Parts and joints in one frame that all parts share in the reference pose; metres.
+    """Parts and joints in one frame that all parts share in the reference pose; meters.
 
     Attributes:
       parts: K meshes.
@@ -24,7 +24,7 @@ class Reference:
       parents: J parts; joint j carries part j + 1.
       axis: [J, 3] unit vectors.
       pivot: [J, 3] points on the axes.
-      limits: [J, 2] radians or metres from the reference pose; may be infinite.
+      limits: [J, 2] radians or meters from the reference pose; may be infinite.
     """
 
     parts: tuple[Mesh, ...]
@@ -125,7 +125,7 @@ class Reference:
         return float(np.arctan2(a * d - b * c, a * c + b * d))
 
     def width(self, joint: int, state: float) -> float:
-        """How far a joint's two parts reach together, metres, at one of its states.
+        """How far a joint's two parts reach together, meters, at one of its states.
 
         Along a slide; in the plane of a turn, the mean over all directions.
         """

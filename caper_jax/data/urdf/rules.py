@@ -2,7 +2,7 @@
 
 A URDF says neither which way is up nor what is open. Every rule here reads it from the direction
 of the joints, the side on which their range lies, and the shape of the parts; conventions of
-modellers (z or y up, objects modelled closed or unfolded) only settle what is left.
+modellers (z or y up, objects modeled closed or unfolded) only settle what is left.
 
 Rest states are snapped to states that mean something in the file: 0, a limit, or 90 deg from one.
 """
@@ -123,7 +123,7 @@ def _perpendicular(ref: Reference) -> np.ndarray:
         sense = np.sign(opening)
     elif abs(opening) <= np.radians(10):
         sense = _opens(ref, 0)
-    else:  # modelled flat open: most of the range closes it
+    else:  # modeled flat open: most of the range closes it
         sense = -_opens(ref, 0)
         opening = sense * abs(opening)
     return np.array([_snap(sense * np.pi / 2 - opening, ref.limits[0], 6.0, quarter=True)])

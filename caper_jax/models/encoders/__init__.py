@@ -1,0 +1,1 @@
+"""Point-cloud encoders: the HS-Encoder of the paper and the fast one."""

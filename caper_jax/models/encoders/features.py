@@ -1,0 +1,96 @@
+"""What an encoder hands to the heads: features at several resolutions, never up-sampled early."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import flax.linen as nn
+import flax.struct
+import jax.numpy as jnp
+
+from caper_jax.models.encoders.neighbors import gather
+from caper_jax.models.layers import Dense, product
+
+
+@flax.struct.dataclass
+class Level:
+    """Features of a subset of the points.
+
+    Attributes:
+      features: [B, M, C].
+      upsample: how rows come back to the N input points: [B, N] the row nearest to each point,
+        or [B, N, M] weights that sum to one; None when the rows are the points themselves.
+    """
+
+    features: Any
+    upsample: Any = None
+
+    def at_points(self, values):
+        """Rows [B, M, C] brought to the input points, [B, N, C]."""
+        if self.upsample is None:
+            return values
+        if self.upsample.ndim == 3:
+            return jnp.einsum("bnm,bmc->bnc", self.upsample, values)
+        return gather(values, self.upsample)
+
+
+@flax.struct.dataclass
+class Features:
+    """Encoder output.
+
+    Attributes:
+      points: [B, N, 3] the centered input cloud.
+      levels: fine to coarse.
+      shared: [B, G] global feature, or None.
+    """
+
+    points: Any
+    levels: tuple[Level, ...]
+    shared: Any = None
+
+    def every(self, stride: int) -> Features:
+        """The same features at every stride-th input point."""
+        if stride == 1:
+            return self
+        levels = tuple(
+            Level(level.features[:, ::stride])
+            if level.upsample is None
+            else Level(level.features, level.upsample[:, ::stride])
+            for level in self.levels
+        )
+        return Features(self.points[:, ::stride], levels, self.shared)
+
+
+class BlockDense(nn.Module):
+    """A dense layer over the concatenation of all levels at every point, without building it.
+
+    Each level is projected at its own resolution and the sums are up-sampled: the same result as
+    concatenating first (paper Sec 5.1.1), for a fraction of the arithmetic.
+
+    Attributes:
+      width: output channels.
+      with_points: whether the centered coordinates are part of the concatenation (the translation
+        and joint heads of the paper).
+      dot_general: of the dense layers, see ``nn.Dense``.
+    """
+
+    width: int
+    with_points: bool = False
+    dot_general: Any = product
+
+    @nn.compact
+    def __call__(self, features: Features):
+        """Features -> [B, N, width]."""
+        dense = partial(Dense, self.width, dot_general=self.dot_general)
+        total: Any = 0.0
+        for number, level in enumerate(features.levels):
+            bias = number == 0
+            part = dense(use_bias=bias, name=f"level{number}")(level.features)
+            total += level.at_points(part)
+        if self.with_points:
+            total += dense(use_bias=False, name="points")(features.points)
+        if features.shared is not None:
+            shared = dense(use_bias=False, name="shared")(features.shared)
+            total += shared[:, None, :]
+        return total

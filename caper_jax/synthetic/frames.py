@@ -1,0 +1,294 @@
+"""Endless labeled frames from a key: instance, joint states, camera, rays, sensor, points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from caper_jax.articulation.category import Category
+from caper_jax.articulation.kinematics import forward_kinematics
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.config import GeneratorConfig
+from caper_jax.geometry.raster_order import grid_raster_order
+from caper_jax.synthetic import masks
+from caper_jax.synthetic import sensor as sensors
+from caper_jax.synthetic.camera import camera_pose, draw_camera
+from caper_jax.synthetic.instances import InstanceBank, build_bank, draw_instances
+from caper_jax.synthetic.ray_casting import FAR, nearest_part, part_depths, projected_bounds
+from caper_jax.synthetic.surroundings import add_clutter, spill_on_table, table_depth
+
+_MARGIN = 0.04  # of the object's projected box, on each side
+
+
+@flax.struct.dataclass
+class Batch:
+    """Labeled frames.
+
+    Attributes:
+      points: [B, N, 3] meters, camera frame, in scan order.
+      labels: [B, N] int32 part of each point, -1 for residue.
+      pose: ArticulatedPose with leading axis B.
+      visible: [B, K] int32 pixels of each part in the mask, before sampling.
+      instance: [B] int32 index into the bank.
+      visibility: [B, K] ``visible`` over the pixels that the part would have if nothing, neither
+        another part nor something else, were in front of it; None unless measured.
+    """
+
+    points: Any
+    labels: Any
+    pose: ArticulatedPose
+    visible: Any
+    instance: Any
+    visibility: Any = None
+
+
+def systematic(key, hit, count: int):
+    """Raster indices [count] of hits [G, G], evenly spread in scan order; repeating if too few.
+
+    The r-th pick is hit number floor((r + u) n / count): no sort, uniform over the image.
+    """
+    order = jnp.asarray(grid_raster_order(hit.shape[0]), jnp.int32)
+    running = jnp.cumsum(hit.ravel()[order])
+    total = running[-1]
+    offset = jax.random.uniform(key, (count,))
+    rank = jnp.floor((jnp.arange(count) + offset) * total / count).astype(jnp.int32) + 1
+    # In float32, r + u may be rounded up to count: that would be one hit too many.
+    rank = jnp.minimum(rank, total)
+    place = jnp.clip(jnp.searchsorted(running, rank, side="left"), 0, order.shape[0] - 1)
+    return order[place]
+
+
+def draw_state_and_poses(key, instance: InstanceBank, category: Category):
+    """Joint states over the instance's range, and a camera around it.
+
+    Returns:
+      state [J], part poses [K, 4, 4] rest frame -> camera, and the diagonal at rest, meters.
+    """
+    state_key, camera_key = jax.random.split(key)
+    low, high = instance.limits[:, 0], instance.limits[:, 1]
+    state = low + jax.random.uniform(state_key, low.shape) * (high - low)
+    diagonal = rest_diagonal(instance)
+    view = category.viewpoint
+    root = camera_pose(draw_camera(camera_key, view), view, diagonal)
+    return state, part_poses(root, instance, state, category), diagonal
+
+
+def rest_diagonal(instance: InstanceBank):
+    """Diagonal of the whole object's box at rest, meters."""
+    low = (instance.box_center - instance.size / 2).min(0)
+    high = (instance.box_center + instance.size / 2).max(0)
+    return jnp.linalg.norm(high - low)
+
+
+def part_poses(root, instance: InstanceBank, state, category: Category):
+    """Poses [..., K, 4, 4] of all parts from the root's [..., 4, 4] and the states [..., J]."""
+    return forward_kinematics(
+        root,
+        instance.joint_axis,
+        instance.joint_pivot,
+        state,
+        category.joint_types,
+        category.parents,
+    )
+
+
+class Keys(NamedTuple):
+    """PRNG keys of a frame; a video keeps some of them from frame to frame."""
+
+    scene: Any
+    grid: Any
+    mask: Any
+    sensor: Any
+    loss: Any
+    pick: Any
+    noise: Any
+    residue: Any
+
+
+def render_frame(
+    key, instance: InstanceBank, category: Category, config: GeneratorConfig, mix
+) -> Batch:
+    """One labeled frame of one instance (InstanceBank without its leading axis).
+
+    Returns:
+      Batch without its leading axis; ``instance`` is None.
+    """
+    keys = Keys(*jax.random.split(key, 8))
+    state, poses, _ = draw_state_and_poses(keys.scene, instance, category)
+    return observe(keys, instance, state, poses, category, config, mix)
+
+
+def observe(
+    keys: Keys,
+    instance: InstanceBank,
+    state,
+    poses,
+    category: Category,
+    config: GeneratorConfig,
+    mix,
+) -> Batch:
+    """What a depth camera and a mask show of one instance in a given pose.
+
+    Args:
+      keys: PRNG keys (``scene`` is not used).
+      instance: InstanceBank without its leading axis.
+      state: [J] joint states.
+      poses: [K, 4, 4] part rest frame -> camera.
+      category: the instance's category.
+      config: what disturbs the frame.
+      mix: sensors to draw from, ``sensor.sensor_mix(config.noise)``.
+
+    Returns:
+      Batch without its leading axis; ``instance`` is None.
+    """
+    rays = _ray_grid(keys.grid, instance, poses, config)
+    flat = (rays[0].ravel(), rays[1].ravel())
+    alone = part_depths(instance.groups, poses, flat)
+    depth, part = (image.reshape(rays[0].shape) for image in nearest_part(alone))
+    depth, part, hit = _apply_mask(keys.mask, depth, part, instance, poses, rays, category, config)
+    visible = jnp.stack([(hit & (part == k)).sum() for k in range(category.num_parts)])
+    visibility = None
+    if config.measure_visibility:
+        visibility = visible / jnp.maximum((alone < FAR).sum(axis=1), 1)
+
+    sensor = sensors.draw(keys.sensor, mix)
+    surface = sensors.surface(depth, hit, rays)
+    seen = sensors.lose(keys.loss, sensor, surface, hit)
+    if config.dropout > 0 or config.holes > 0:
+        lost = masks.drop(jax.random.fold_in(keys.loss, 1), hit, config.dropout, config.holes)
+        seen = masks.keep_most(seen & ~lost, seen)
+    seen = jnp.where(seen.any(), seen, hit)
+
+    # Only the chosen pixels are measured: random numbers are what costs on a CPU.
+    index = systematic(keys.pick, seen, config.num_points)
+    chosen = jax.tree.map(lambda image: image.ravel()[index], surface)
+    points = sensors.measure(keys.noise, sensor, chosen, (flat[0][index], flat[1][index]))
+    labels = part.ravel()[index]
+    if config.residue > 0:
+        diagonal = rest_diagonal(instance)
+        points, labels = _add_residue(keys.residue, points, labels, diagonal, config.residue)
+    if config.depth_scale > 0:
+        error = jax.random.normal(jax.random.fold_in(keys.sensor, 1))
+        points *= 1.0 + config.depth_scale * jnp.clip(error, -3.0, 3.0)
+    pose = ArticulatedPose(
+        rotation=poses[:, :3, :3],
+        translation=poses[:, :3, 3],
+        size=instance.size,
+        box_center=instance.box_center,
+        joint_axis=instance.joint_axis,
+        joint_pivot=instance.joint_pivot,
+        joint_state=state,
+    )
+    return Batch(points, labels, pose, visible, None, visibility)
+
+
+def _ray_grid(key, instance: InstanceBank, poses, config: GeneratorConfig):
+    """Rays (x [G, G], y [G, G]) over the object's projection, with a random sub-pixel offset."""
+    low, high = projected_bounds(instance.groups, poses)
+    if config.table > 0 or config.clutter > 0:
+        # Room for what a mask that is too wide takes in.
+        low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
+    steps = jnp.arange(config.grid) + 0.0
+    offset = jax.random.uniform(key, (2,))
+    x = low[0] + (steps + offset[0]) / config.grid * (high[0] - low[0])
+    y = low[1] + (steps + offset[1]) / config.grid * (high[1] - low[1])
+    return jnp.meshgrid(x, y, indexing="xy")
+
+
+def _apply_mask(
+    key,
+    depth,
+    part,
+    instance: InstanceBank,
+    poses,
+    rays,
+    category: Category,
+    config: GeneratorConfig,
+):
+    """Depth, part and pixels [G, G] that the mask takes for the object."""
+    hit = part >= 0
+    if config.occlusion > 0:
+        hit = masks.occlude(key, hit, config.occlusion, config.occluders)
+    if config.table > 0 or config.clutter > 0:
+        table = table_depth(instance, poses, category.viewpoint, rays)
+    if config.table > 0:
+        depth, hit = spill_on_table(
+            jax.random.fold_in(key, 3), depth, part, hit, table, config.table, config.spill
+        )
+    if config.erosion > 0:
+        eroded = masks.erode(jax.random.fold_in(key, 2), hit, config.erosion)
+        # A mask that takes in the table is not too tight.
+        hit = jnp.where((hit & (part < 0)).any(), hit, eroded)
+    if config.clutter > 0:
+        depth, part, hit = add_clutter(
+            jax.random.fold_in(key, 4),
+            depth,
+            part,
+            hit,
+            table,
+            rest_diagonal(instance),
+            rays,
+            config.clutter,
+            config.spill,
+        )
+    return depth, part, hit
+
+
+def _add_residue(key, points, labels, diagonal, largest: float):
+    """Pushes a few points along their rays, as pixels that see past the object."""
+    count = labels.shape[0]
+    uniform = jax.random.uniform(key, (2 * count + 1,), minval=1e-7)
+    chosen = uniform[:count] < uniform[-1] * largest
+    push = -jnp.log(uniform[count:-1]) * 0.2 * diagonal
+    factor = 1.0 + jnp.where(chosen, push / jnp.linalg.norm(points, axis=-1), 0.0)
+    return points * factor[:, None], jnp.where(chosen, -1, labels)
+
+
+class Generator:
+    """Draws labeled batches of one category; the bank lives on the default device.
+
+    Example:
+      generator = Generator(categories.get("box"), GeneratorConfig(noise=("kinect",)))
+      batch = generator.batch(jax.random.key(0), 24)   # points [24, 1024, 3]
+    """
+
+    def __init__(
+        self,
+        category: Category,
+        config: GeneratorConfig | None = None,
+        split: str = "train",
+        seed: int = 0,
+    ) -> None:
+        self.category = category
+        self.config = config or GeneratorConfig()
+        self.split = split
+        self.seed = seed
+        models = draw_instances(category, self.config.instances, split, seed)
+        self.bank = jax.tree.map(jnp.asarray, build_bank(models))
+        self._mix = sensors.sensor_mix(self.config.noise)
+        # The bank is an argument: as a constant it would go through the compiler.
+        self._batch = jax.jit(self.draw, static_argnames="batch_size")
+
+    def draw(self, key, batch_size: int, bank: InstanceBank | None = None) -> Batch:
+        """Traceable form of ``batch``: call it inside a larger jitted function."""
+        bank = self.bank if bank is None else bank
+        pick, rest = jax.random.split(key)
+        index = jax.random.randint(pick, (batch_size,), 0, bank.num_instances)
+        instances = jax.tree.map(lambda values: values[index], bank)
+        frame = partial(render_frame, category=self.category, config=self.config, mix=self._mix)
+        frames = jax.vmap(frame)(jax.random.split(rest, batch_size), instances)
+        return replace(frames, instance=index)
+
+    def batch(self, key, batch_size: int) -> Batch:
+        """A batch of frames; the same key gives the same batch.
+
+        Args:
+          key: PRNG key.
+          batch_size: B.
+        """
+        return self._batch(key, batch_size=batch_size, bank=self.bank)

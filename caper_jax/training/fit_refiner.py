@@ -1,0 +1,218 @@
+"""Fits the network that corrects estimates by the sides of their boxes (``networks.sides``).
+
+Both stages are trained and stay as they are. They read generated frames; what they are off by there
+is regressed on what the points say about their boxes, with the L1 losses of Eqs 17 to 21.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from caper_jax.articulation.category import Category
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.config import PRESETS, GeneratorConfig, NetworkConfig, RefinerConfig
+from caper_jax.errors import CaperError
+from caper_jax.estimator import Estimator, load
+from caper_jax.geometry.frames import rotate, view_rotation
+from caper_jax.lie import se3
+from caper_jax.models.files import write_model
+from caper_jax.models.pipeline import articulated_pose, read, refinements, refiner_inputs
+from caper_jax.models.refiner import BoxRefiner, RefinerOutput
+from caper_jax.progress import progress
+from caper_jax.synthetic.frames import Batch
+from caper_jax.training.fit_uncertainty import mixed_frames, nearer_symmetry
+
+FRAMES = 40_000
+_SPLIT = "train"
+_BATCH = 512
+_STEPS = 6000  # at least
+_PASSES = 25  # over many frames
+_PER_CALL = 100  # steps compiled into one call
+_RATE = 2e-3
+_DECAY = 1e-3
+_DROPOUT = 0.1  # of features: frames are few
+_TURNED = np.radians(20.0)  # a root that is off by more lies in another box; nothing to learn
+_WEIGHTS = RefinerOutput(size=1.0, center=1.0, twist=4.0, pivot=2.0, state=2.0)
+
+
+class TurnedModel(CaperError):
+    """A model that is too wrong to be corrected by the sides of its boxes."""
+
+
+def fit_sides(
+    estimator: Estimator, config: GeneratorConfig, width: int, frames: int = FRAMES, seed: int = 0
+) -> dict[str, Any]:
+    """Weights of a ``BoxRefiner`` for a trained model.
+
+    Args:
+      estimator: the model; a network of this kind in it is not used.
+      config: what half of the frames look like; the others have the sensors' noise alone. Of
+        other shapes than those that a run with the same seed was trained on.
+      width: of the network.
+      frames: how many to fit on, besides a quarter of them for a first round.
+      seed: of shapes, frames and weights.
+
+    Raises:
+      CaperError: too few frames; TurnedModel, a model that is turned in nearly all of them.
+    """
+    check_frame_count(frames)
+    network = replace(estimator.network, refiner=RefinerConfig())
+    first = _regressed(estimator, network, config, width, max(frames // 4, 2 * _BATCH), seed + 1)
+    # Then both what the stages find and what the first round makes of it.
+    params = {**estimator.variables["params"], "refiner": first}
+    estimator = Estimator(estimator.category, network, {**estimator.variables, "params": params})
+    network = replace(network, refiner=RefinerConfig(width, iterations=1))
+    return _regressed(estimator, network, config, width, frames, seed + 2)
+
+
+def check_frame_count(frames: int) -> None:
+    """Raises CaperError where so many frames are too few to fit sides on."""
+    if frames < 2 * _BATCH:
+        raise CaperError(f"fitting sides needs {2 * _BATCH} frames or more, got {frames}")
+
+
+def _regressed(
+    estimator: Estimator,
+    network: NetworkConfig,
+    config: GeneratorConfig,
+    width: int,
+    frames: int,
+    seed: int,
+) -> dict[str, Any]:
+    """Weights regressed on what such a network finds, before and after its sides."""
+    measure = jax.jit(partial(_measure, category=estimator.category, network=network))
+    rows = []
+    title = "reading frames for sides"
+    for batch in mixed_frames(estimator, config, _SPLIT, frames, seed, title):
+        rows += jax.device_get(measure(estimator.variables, batch))
+    features, off, learn = (
+        jax.tree.map(lambda *parts: np.concatenate(parts), *column)
+        for column in zip(*rows, strict=True)
+    )
+    if learn.mean() < 0.1:
+        raise TurnedModel(
+            f"the root is turned by more than {np.degrees(_TURNED):.0f} deg in "
+            f"{100 - 100 * learn.mean():.0f} % of {frames} frames: train the model longer before "
+            "its sides are fitted, or set network.refiner.width = 0"
+        )
+    features, off = jax.tree.map(lambda values: values[learn], (features, off))
+    return _fit(features, off, width, estimator.category.num_parts, seed)
+
+
+def add_sides(
+    directory: str | Path,
+    category: str,
+    config: GeneratorConfig,
+    width: int | None = None,
+    frames: int = FRAMES,
+    seed: int = 0,
+) -> None:
+    """Fits such a network for the model in a directory and writes it there, in place of an older.
+
+    What the model said about its own errors is dropped from its card: it says less wrong now.
+
+    Args:
+      directory: of the model.
+      category: its name, or FILE.py:NAME.
+      width: of the network; None for that of the older, or of the fast preset's.
+      config, frames, seed: see ``fit_sides``.
+
+    Raises:
+      CaperError: see ``fit_sides`` and ``estimator.load``; the model is left as it was.
+    """
+    estimator = load(category, directory)
+    card, variables = estimator.card, estimator.variables
+    width = width or estimator.network.refiner.width or PRESETS["fast"].network.refiner.width
+    fitted = fit_sides(estimator, config, width, frames, seed)
+    params = {**variables["params"], "refiner": fitted}
+    run = {**card["run"], "network": {**card["run"]["network"], "sides_width": width}}
+    kept = {name: value for name, value in card.items() if name != "calibration"}
+    sides = {"frames": frames, "split": _SPLIT, "seed": seed}
+    write_model(directory, {**variables, "params": params}, {**kept, "run": run, "refiner": sides})
+
+
+def _measure(variables, batch: Batch, category: Category, network: NetworkConfig):
+    """(features [B, F], RefinerOutput that would be right, whether to learn it [B]) of every
+    estimate: before and after each pass of the network's sides."""
+    view = view_rotation(batch.points, category.viewpoint.camera_roll)
+    cloud = rotate(view, batch.points) * category.unit
+    found = read(variables, cloud, category, network)
+    rows = []
+    for reading in refinements(variables, found, cloud, category, network):
+        pose = articulated_pose(reading, view, category)
+        truth = nearer_symmetry(pose, batch.pose, category)
+        off = difference(pose, truth, category)
+        learn = jnp.linalg.norm(off.twist[:, :3], axis=-1) < _TURNED
+        rows.append((refiner_inputs(found, reading, cloud, category), off, learn))
+    return rows
+
+
+def difference(pose: ArticulatedPose, truth: ArticulatedPose, category: Category) -> RefinerOutput:
+    """What takes an estimate [B, ...] to the truth; ``models.refiner.apply_residual`` adds it.
+
+    Pivots differ by what lies across the true axis: along it they may be anywhere.
+    """
+    unit = category.unit
+    one, other = (se3.from_rt(p.rotation[:, 0], p.translation[:, 0] * unit) for p in (pose, truth))
+    shift = (truth.joint_pivot - pose.joint_pivot) * unit
+    along = (shift * truth.joint_axis).sum(-1, keepdims=True) * truth.joint_axis
+    return RefinerOutput(
+        size=jnp.log(truth.size / pose.size),
+        center=(truth.box_center - pose.box_center) / pose.size,
+        twist=se3.log(se3.compose(se3.inverse(one), other)),
+        pivot=shift - along,
+        state=(truth.joint_state - pose.joint_state) * category.state_units,
+    )
+
+
+def _fit(features: np.ndarray, off: RefinerOutput, width: int, num_parts: int, seed: int) -> Any:
+    """Weights of the network, from features [S, F] and targets."""
+    module = BoxRefiner(width, num_parts)
+    keys = jax.random.split(jax.random.key(seed), 2)
+    params = module.init(keys[0], features[:1])["params"]
+    mean, deviation = features.mean(0), features.std(0)
+    scale = 1.0 / (deviation + 0.02)  # what never varies stays small
+    params |= {"mean": jnp.asarray(mean), "scale": jnp.asarray(scale)}
+    calls = max(_STEPS, _PASSES * len(features) // _BATCH) // _PER_CALL
+    schedule = optax.cosine_decay_schedule(_RATE, calls * _PER_CALL)
+    optimizer = optax.adamw(schedule, weight_decay=_DECAY)
+
+    def loss(free, chosen, right, key):
+        kept = jax.random.bernoulli(key, 1 - _DROPOUT, chosen.shape)
+        chosen = jnp.where(kept, chosen, mean)
+        said = module.apply({"params": params | free}, chosen)
+        errors = jax.tree.map(lambda s, r: jnp.abs(s - r).mean(), said, right)
+        return sum(jax.tree.leaves(jax.tree.map(jnp.multiply, _WEIGHTS, errors)))
+
+    @jax.jit
+    def several(carry, steps, data):
+        def one(carry, key):
+            free, state = carry
+            draw, drop = jax.random.split(key)
+            index = jax.random.randint(draw, (_BATCH,), 0, len(features))
+            chosen, right = jax.tree.map(lambda values: values[index], data)
+            value, gradient = jax.value_and_grad(loss)(free, chosen, right, drop)
+            update, state = optimizer.update(gradient, state, free)
+            return (optax.apply_updates(free, update), state), value
+
+        return jax.lax.scan(one, carry, steps)
+
+    data = jax.device_put((features, off))
+    free = {name: value for name, value in params.items() if name not in ("mean", "scale")}
+    carry = free, optimizer.init(free)
+    with progress("fitting sides", total=calls * _PER_CALL) as bar:
+        for number in range(calls):
+            own = jax.random.split(jax.random.fold_in(keys[1], number), _PER_CALL)
+            carry, values = several(carry, own, data)
+            bar.update(_PER_CALL, loss=float(values.mean()))
+    # Rounded to bfloat16, which costs nothing that can be measured: files become smaller.
+    short = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16).astype(jnp.float32), carry[0])
+    return jax.device_get(params | short)

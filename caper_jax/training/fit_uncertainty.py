@@ -1,0 +1,161 @@
+"""Calibrates what a model says about its own errors (``caper_jax.models.uncertainty``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from caper_jax.articulation.category import Category
+from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.articulation.symmetry import apply_symmetry, is_ambiguous
+from caper_jax.config import GeneratorConfig
+from caper_jax.errors import CaperError
+from caper_jax.estimator import Estimator, estimate
+from caper_jax.lie import so3
+from caper_jax.models.uncertainty import COVERAGE
+from caper_jax.progress import progress
+from caper_jax.synthetic.frames import Batch, Generator
+from caper_jax.synthetic.sensor import CAMERAS
+
+FRAMES = 4096
+SPLIT = "val"
+_BATCH = 32
+_SMALLEST = 1e-5  # radians or units: below it an error has no logarithm worth fitting
+_ITERATIONS = 200
+
+
+def calibrate(
+    estimator: Estimator, config: GeneratorConfig, frames: int = FRAMES, seed: int = 0
+) -> dict[str, Any]:
+    """The "calibration" section of a model card, JSON-ready.
+
+    Args:
+      estimator: the model.
+      config: what half of the frames look like; the others have the sensors' noise alone. Of
+        instances that training never saw, and of the cameras among its sensors: fitted on clean
+        depth as well, regions would be too small on what a camera gives.
+      frames: how many to fit on.
+      seed: of shapes and frames.
+
+    Raises:
+      CaperError: too few frames.
+    """
+    check_frame_count(frames)
+    cameras = tuple(name for name in config.noise if name in CAMERAS) or config.noise
+    config = replace(config, noise=cameras)
+    measure = jax.jit(partial(_measure, estimator=estimator))
+    rows = [
+        jax.device_get(measure(estimator.variables, batch))
+        for batch in mixed_frames(estimator, config, SPLIT, frames, seed, "calibrating")
+    ]
+    found, *errors = (np.concatenate(column)[:frames] for column in zip(*rows, strict=True))
+    low, high = np.quantile(found, [0.01, 0.99], axis=(0, 1))
+    inside = np.clip(found, low, high)
+    rotation, translation, state = (
+        [
+            quantile_regression(inside[:, -count + k], np.log(np.maximum(error[:, k], _SMALLEST)))
+            for k in range(count)
+        ]
+        for error, count in zip(errors, (error.shape[1] for error in errors), strict=True)
+    )
+    section = {"rotation": rotation, "translation": translation, "state": state}
+    section |= {"low": low, "high": high}
+    rounded = {name: np.round(np.asarray(value), 5).tolist() for name, value in section.items()}
+    data = {"frames": frames, "split": SPLIT, "seed": seed, "noise": list(cameras)}
+    return {**rounded, "coverage": COVERAGE, **data}
+
+
+def check_frame_count(frames: int) -> None:
+    """Raises CaperError where so many frames are too few to calibrate on."""
+    if frames < 10 * _BATCH:
+        raise CaperError(f"calibration needs {10 * _BATCH} frames or more, got {frames}")
+
+
+def mixed_frames(
+    estimator: Estimator, config: GeneratorConfig, split: str, frames: int, seed: int, title: str
+) -> Iterator[Batch]:
+    """Batches of generated frames, by turns as ``config`` has them and with sensors' noise alone.
+
+    Args:
+      estimator: whose category and number of points they have.
+      config: noise, and all else that frames may suffer from.
+      split: of the instances.
+      frames: at least so many.
+      seed: of shapes and frames.
+      title: of the progress display.
+    """
+    rough = replace(
+        config,
+        instances=min(config.instances, frames),
+        num_points=estimator.network.num_points,
+    )
+    clean = GeneratorConfig(
+        instances=rough.instances, grid=rough.grid, num_points=rough.num_points, noise=rough.noise
+    )
+    generators = [Generator(estimator.category, one, split, seed) for one in (rough, clean)]
+    key = jax.random.key(seed)
+    with progress(title, total=frames) as bar:
+        for start in range(0, frames, _BATCH):
+            generator = generators[start // _BATCH % 2]
+            yield generator.batch(jax.random.fold_in(key, start), _BATCH)
+            bar.update(min(_BATCH, frames - start))
+
+
+def quantile_regression(inputs: np.ndarray, target: np.ndarray, level: float = COVERAGE):
+    """Coefficients [F + 1], the constant last, of the linear ``level`` quantile.
+
+    Minimizes the pinball loss by majorization: each step replaces |r| by a parabola that touches
+    it where the residual r is, and solves the weighted least squares that follow.
+
+    Args:
+      inputs: [S, F].
+      target: [S].
+      level: share of the targets that lie below.
+    """
+    design = np.column_stack([inputs, np.ones(len(target))]).astype(np.float64)
+    # A hair of ridge: evidence that never varies leaves its coefficient at zero.
+    ridge = 1e-6 * len(target) * np.eye(design.shape[1])
+    found = np.linalg.solve(design.T @ design + ridge, design.T @ target)
+    for _ in range(_ITERATIONS):
+        weight = 1.0 / (np.abs(target - design @ found) + 1e-4)
+        weighted = design * weight[:, None]
+        right = weighted.T @ target + (2.0 * level - 1.0) * design.sum(0)
+        found = np.linalg.solve(weighted.T @ design + ridge, right)
+    return found
+
+
+def _measure(variables, batch: Batch, estimator: Estimator):
+    """(evidence [B, K, E], errors of rotation [B, K], translation [B, K], state [B, J])."""
+    category = estimator.category
+    prediction = estimate(variables, batch.points, category, estimator.network)
+    pose, truth = prediction.pose, nearer_symmetry(prediction.pose, batch.pose, category)
+    shift = (pose.translation - truth.translation) * category.unit
+    state = jnp.abs(pose.joint_state - truth.joint_state) * category.state_units
+    turn = so3.geodesic_distance(pose.rotation, truth.rotation)
+    return prediction.evidence, turn, jnp.linalg.norm(shift, axis=-1), state
+
+
+def nearer_symmetry(pose: ArticulatedPose, truth: ArticulatedPose, category: Category):
+    """The truth [B, ...]; of objects that a category declares ambiguous the reading that is nearer.
+
+    Nobody can know which of equal halves bears which name: an estimate need not doubt itself there.
+    """
+    for symmetry in category.symmetries:
+        other = apply_symmetry(truth, symmetry, category)
+        turns = [
+            so3.geodesic_distance(pose.rotation[:, 0], reading.rotation[:, 0])
+            for reading in (other, truth)
+        ]
+        nearer = is_ambiguous(truth.size, symmetry) & (turns[0] < turns[1])
+
+        def pick(new, old, nearer=nearer):
+            return jnp.where(nearer.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        truth = jax.tree.map(pick, other, truth)
+    return truth

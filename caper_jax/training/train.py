@@ -1,0 +1,288 @@
+"""A whole training run of one category: generator, networks, loop, validation, export."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import platform
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from caper_jax import categories
+from caper_jax._version import __version__
+from caper_jax.articulation.category import Category
+from caper_jax.config import (
+    PRESETS,
+    LoaderConfig,
+    RefinerConfig,
+    RunConfig,
+    preset,
+    to_dict,
+)
+from caper_jax.data.loader import LabeledClouds, Loader
+from caper_jax.data.readers import open_dataset
+from caper_jax.errors import CaperError
+from caper_jax.estimator import load, network_of
+from caper_jax.models.files import (
+    CARD_FILE,
+    WEIGHTS_FILE,
+    flatten,
+    read_card,
+    read_model,
+    unflatten,
+    write_card,
+    write_model,
+)
+from caper_jax.synthetic.frames import Batch, Generator
+from caper_jax.training import fit_refiner, parallel
+from caper_jax.training.fit_uncertainty import calibrate
+from caper_jax.training.loop import FitResult, fit
+from caper_jax.training.objective import Objective
+from caper_jax.training.run_directory import FILE as CONFIG_FILE
+from caper_jax.training.run_directory import STARTED_FROM
+
+_SAMPLE = 512  # frames that give the trivial predictor of the model card
+
+
+def preset_of(directory: str | Path, category: str) -> RunConfig:
+    """The run of the preset that a model is of, with the network of that model.
+
+    Raises:
+      CaperError: no model directory, a damaged card, or an unknown category.
+    """
+    network = network_of(read_card(directory), Path(directory))
+    name = next(name for name, other in PRESETS.items() if other.network.encoder == network.encoder)
+    config = preset(name, category)
+    return replace(
+        config, network=network, data=replace(config.data, num_points=network.num_points)
+    )
+
+
+def train(config: RunConfig, directory: str | Path, initial: str | Path | None = None) -> FitResult:
+    """Trains, validates and writes a model directory; resumes when the directory holds the run.
+
+    Args:
+      config: the run.
+      directory: gets config.json, metrics.jsonl, checkpoints/ and, once the budget is used up,
+        weights.npz and model.json. The model of a run that had ended before stays as it is.
+      initial: model directory whose weights the run starts from (its card is kept in the new
+        one); by default the weights are random. A model of another category gives its encoders.
+
+    Raises:
+      CaperError: see ``training.loop.fit``; a ``init_weight_average`` of no model of this category.
+    """
+    category = categories.get(config.category)
+    config = replace(config, category=category.name)  # FILE.py:NAME may be spelled in many ways
+    task = Objective(category, config.network, config.loss)
+    description = to_dict(config)
+    description.pop("training")
+    variables = task.init(jax.random.key(config.training.seed))
+    stored: dict[str, Any] = {}
+    started_from, same = None, False
+    if initial is not None:
+        started_from, stored = read_model(initial)
+        same = started_from.get("category") == category.name
+        variables = initial_variables(variables, stored, initial, same)
+        description[STARTED_FROM] = started_from
+    if config.init_weight_average and not same:
+        raise CaperError(
+            f"init_weight_average = {config.init_weight_average} needs a model of "
+            f"{category.name!r} to start from"
+        )
+    mesh = _mesh(config.training.batch_size)
+    fit_task = partial(
+        fit, directory, config.training, task.loss, variables, mesh=mesh, description=description
+    )
+    if config.loader is None:
+        result, draw_sample = _fit_generated(fit_task, config, category)
+    else:
+        result, draw_sample = _fit_dataset(fit_task, config, config.loader)
+    if result.finished and jax.process_index() == 0 and not _complete(directory, result):
+        card = _card(config, result, draw_sample())
+        if started_from is not None:
+            card |= _with_origin(card, started_from)
+        trained = jax.device_get(result.state.variables)
+        if config.init_weight_average:
+            trained = averaged(stored, trained, config.init_weight_average)
+        write_model(directory, trained, card)
+        if config.loader is None:  # of the weights as they are stored, and once they are
+            _finish(config, directory)
+        write_card(directory, {**read_card(directory), "complete": _digest(directory)})
+    # The others wait: one that ends takes the run with it after some minutes.
+    parallel.agree([0.0])
+    return result
+
+
+def _complete(directory: str | Path, result: FitResult) -> bool:
+    """Whether the directory has the model of this run with all that belongs to it."""
+    if not all((Path(directory) / name).is_file() for name in (CARD_FILE, WEIGHTS_FILE)):
+        return False
+    card = read_card(directory)
+    run = card.get("complete"), card.get("steps")
+    return run == (_digest(directory), int(result.state.step))
+
+
+def _digest(directory: str | Path) -> str:
+    """Tells the run of a directory from others, by its configuration."""
+    return hashlib.sha256((Path(directory) / CONFIG_FILE).read_bytes()).hexdigest()[:16]
+
+
+def _finish(config: RunConfig, directory: str | Path) -> None:
+    """Adds to a model what is fitted on its own estimates: sides, then how wrong it is."""
+    seed = config.training.seed
+    if config.network.refiner.width:
+        arguments = (config.network.refiner.width, config.network.refiner.frames, seed)
+        try:
+            fit_refiner.add_sides(directory, config.category, config.data, *arguments)
+        except fit_refiner.TurnedModel as error:  # a short run: the model is usable as it is
+            print(f"sides are not fitted: {error}", file=sys.stderr)
+    if config.calibration_frames:
+        estimator = load(config.category, directory)
+        calibration = calibrate(estimator, config.data, config.calibration_frames, seed)
+        write_card(directory, {**estimator.card, "calibration": calibration})
+
+
+def _fit_generated(
+    fit_task: Callable[..., FitResult], config: RunConfig, category: Category
+) -> tuple[FitResult, Callable[[], Batch | LabeledClouds]]:
+    """Trains on endless generated frames; also a function that draws some of them."""
+    generator = Generator(category, config.data, split="train", seed=config.training.seed)
+    batch_size = config.training.batch_size
+
+    def batch_fn(key, bank):
+        return generator.draw(key, batch_size, bank)
+
+    result = fit_task(batch_fn=batch_fn, data=generator.bank)
+    return result, lambda: generator.batch(jax.random.key(config.training.seed), _SAMPLE)
+
+
+def _fit_dataset(
+    fit_task: Callable[..., FitResult], config: RunConfig, source: LoaderConfig
+) -> tuple[FitResult, Callable[[], Batch | LabeledClouds]]:
+    """Trains on a dataset; also a function that reads some of its frames."""
+    dataset = open_dataset(
+        source.format,
+        source.root,
+        config.category,
+        source.split,
+        num_points=4 * config.network.num_points,  # every epoch picks others of them
+    )
+    arguments = (config.network.num_points, config.training.seed)
+    with Loader(
+        dataset,
+        config.training.batch_size,
+        *arguments,
+        workers=source.workers,
+        prefetch=source.prefetch,
+        cache_gib=source.cache_gib,
+    ) as loader:
+        result = fit_task(batches=loader)
+
+    def draw_sample() -> LabeledClouds:
+        size = min(_SAMPLE, len(dataset))
+        with Loader(dataset, size, *arguments, process=(0, 1), prefetch=0) as once:
+            return once(0)
+
+    return result, draw_sample
+
+
+def _mesh(batch_size: int) -> jax.sharding.Mesh | None:
+    """All devices; in a single process as many as divide the batch, None for one."""
+    devices = jax.devices()
+    if jax.process_count() == 1:
+        devices = devices[: math.gcd(batch_size, len(devices))]
+    return parallel.data_mesh(devices) if len(devices) > 1 else None
+
+
+def initial_variables(
+    template: Any, stored: Any, directory: str | Path, same_category: bool
+) -> Any:
+    """Stored weights in the place of random ones; CaperError where they do not fit.
+
+    A model of another category gives its encoders only: outputs of its heads would begin with that
+    category's conventions, and from an axis that points the other way no gradient leads back. A
+    model without a turn head gets a new one. What was fitted on its estimates is left behind.
+    """
+    wanted, found = flatten(template), flatten(stored)
+    found = {name: leaf for name, leaf in found.items() if not name.startswith("params/refiner/")}
+    new = {name for name in wanted if "/turn/" in name} - found.keys()
+    taken = [n for n in wanted if (same_category and n not in new) or "/encoder/" in n]
+    fits = all(name in found and np.shape(found[name]) == np.shape(wanted[name]) for name in taken)
+    if not fits or (same_category and found.keys() != wanted.keys() - new):
+        raise CaperError(
+            f"{directory}: its weights are of another network than this run's; leave out the "
+            "preset and the network settings, and the run has its"
+        )
+    return unflatten(wanted | {name: jnp.asarray(found[name], jnp.float32) for name in taken})
+
+
+def averaged(start: Any, trained: Any, share: float) -> Any:
+    """Weights of which ``share`` is what a run started from; what is new in it is as trained."""
+    known, mixed = flatten(start), flatten(trained)
+    for name in mixed.keys() & known.keys():
+        mixed[name] = share * known[name].astype(np.float32) + (1 - share) * mixed[name]
+    return unflatten(mixed)
+
+
+def mean_pose(batch: Batch | LabeledClouds) -> dict[str, Any]:
+    """The trivial predictor: means of the training distribution, JSON-ready.
+
+    Returns:
+      rotation [3][3] (chordal mean of the root's rotation), offset [3] (mean of root origin minus
+      cloud mean, camera frame, meters), size, box_center, joint_axis, joint_pivot, joint_state.
+    """
+    pose = jax.tree.map(np.asarray, batch.pose)
+    left, _, right = np.linalg.svd(pose.rotation[:, 0].astype(np.float64).mean(axis=0))
+    sign = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
+    offset = pose.translation[:, 0] - np.asarray(batch.points).mean(axis=1)
+    axis = pose.joint_axis.mean(axis=0)
+    return {
+        "rotation": (left @ sign @ right).tolist(),
+        "offset": offset.mean(axis=0).tolist(),
+        "size": pose.size.mean(axis=0).tolist(),
+        "box_center": pose.box_center.mean(axis=0).tolist(),
+        "joint_axis": (axis / np.linalg.norm(axis, axis=-1, keepdims=True)).tolist(),
+        "joint_pivot": pose.joint_pivot.mean(axis=0).tolist(),
+        "joint_state": pose.joint_state.mean(axis=0).tolist(),
+    }
+
+
+def _card(config: RunConfig, result: FitResult, sample: Batch | LabeledClouds) -> dict[str, Any]:
+    """The card of both stages: what was trained on what, where, and for how long."""
+    state = result.state
+    stages = replace(config, network=replace(config.network, refiner=RefinerConfig()))
+    return {
+        "category": config.category,
+        "version": __version__,
+        "run": to_dict(stages),
+        "steps": int(state.step),
+        "samples": int(state.step) * config.training.batch_size,
+        "skipped_steps": int(state.skipped),
+        "training_seconds": round(float(state.elapsed)),
+        "hardware": _hardware(),
+        "mean_pose": mean_pose(sample),
+    }
+
+
+def _with_origin(card: dict[str, Any], origin: dict[str, Any]) -> dict[str, Any]:
+    """What the card of a model says about the one it started from, and of both together."""
+    kept = ("category", "version", "commit", "steps", "samples", "training_seconds", "hardware")
+    totals = {
+        f"{key}_in_all": card[key] + origin.get(f"{key}_in_all", origin.get(key, 0))
+        for key in ("samples", "training_seconds")
+    }
+    return {"started_from": {key: origin[key] for key in kept if key in origin}, **totals}
+
+
+def _hardware() -> str:
+    device = jax.devices()[0]
+    kind = platform.processor() or platform.machine() if device.platform == "cpu" else ""
+    return f"{jax.device_count()} x {device.device_kind} {kind}".strip()
