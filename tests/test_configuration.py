@@ -10,7 +10,7 @@ from typing import Literal
 
 import pytest
 
-from caper_jax import configuration
+from caper_jax import config as configuration
 from caper_jax.config import TrainingConfig
 from caper_jax.errors import CaperError
 from caper_jax.training import train as runs

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
+from _helpers.quick import quick_jit
+from _helpers.tiny import network, random_like, random_variables
 from scipy.spatial.transform import Rotation
-from tiny import network, random_like, random_variables
 
 from caper_jax import categories
 from caper_jax import estimator as module

@@ -12,8 +12,8 @@ import sys
 import jax
 import numpy as np
 import pytest
-from quick import quick_jit
-from tiny import network, random_variables
+from _helpers.quick import quick_jit
+from _helpers.tiny import network, random_variables
 
 from caper_jax import categories, cli
 from caper_jax.config import to_dict

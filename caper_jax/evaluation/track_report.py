@@ -154,7 +154,7 @@ def _describe(config: TrackerConfig) -> str:
         return "none"
     described = f"{config.policy}, energy above {config.threshold:g}"
     if config.max_unmatched < 1.0:
-        described += f" or {100 * config.max_unmatched:.0f} % unseen"
+        described += f" or {100 * config.max_unmatched:.0f} % unmatched"
     return described
 
 

@@ -110,8 +110,8 @@ class PartsOutput:
     that reference; everything else is said of the true canonical frame.
 
     Attributes:
-      increment: [B, 6] or [B, 9], see ``networks.increment``; zero where the reference is right.
-      turn: [B, 24] logits of ``networks.turns``: which one the reference needs, before the
+      increment: [B, 6] or [B, 9], see ``models.increment``; zero where the reference is right.
+      turn: [B, 24] logits of ``models.rotation_classes``: which one the reference needs, before the
         increment; None without that head.
       segmentation: [B, N, K] logits.
       heatmap: [B, N, J] in (0, 1), weight of each point's vote (Eq 5).

@@ -3,7 +3,7 @@
 Beyond the paper, whose correction factors (Eq 18) say how good the two directions of the root are
 and nothing of the other parts. What the networks say about a frame anyway, its evidence, gives for
 each part and joint the radius that holds the truth nine times in ten: a linear model of the
-logarithm, fitted once per category (``training.calibration``). A standard deviation is the radius
+logarithm, fitted once per category (``training.fit_uncertainty``). A standard deviation is the radius
 over that of a normal distribution of the same coverage.
 """
 

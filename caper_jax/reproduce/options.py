@@ -21,12 +21,12 @@ class Options:
       category: a subset of the reproduction's categories; empty for all.
       videos, frames: of each category's test set, and of each of its generated videos; frames is
         the size of a test set where that is single frames.
-      mode: how generated videos move, see ``data.synthetic.videos.MODES``.
+      mode: how generated videos move, see ``synthetic.videos.MODES``.
       data, format, split: a data set to measure on instead of generated videos.
       weights: a model directory, or a folder with one per category.
       object_scale: see ``estimator.load``.
       seed: of the generated frames or videos.
-      noise: of their depth, a preset of ``data.synthetic.sensor``.
+      noise: of their depth, a preset of ``synthetic.sensor``.
       given_masks: add runs with the data's part labels.
       network_alone: track by the network's increment, without registration.
       seeds: runs to train of each kind.

@@ -62,7 +62,7 @@ def generated_videos(
     Args:
       folder: keeps one file per set of arguments; made if it does not exist.
       category: has procedural shapes.
-      mode: of ``data.synthetic.videos.MODES``.
+      mode: of ``synthetic.videos.MODES``.
       videos, frames: how many, and of what length.
       seed: of shapes and videos.
       config: what the frames look like.

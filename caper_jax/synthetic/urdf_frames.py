@@ -1,7 +1,7 @@
 """Labeled frames of imported objects: rays into meshes by Embree, the rest as generated ones.
 
 Cameras, joint states, ray grid, sensor noise and the choice of points are those of
-``data.synthetic``; only the caster differs. Every part is a scene of its own in its rest frame,
+``synthetic``; only the caster differs. Every part is a scene of its own in its rest frame,
 into which the rays are moved; the nearest hit of all parts counts.
 """
 

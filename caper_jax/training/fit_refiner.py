@@ -1,4 +1,4 @@
-"""Fits the network that corrects estimates by the sides of their boxes (``networks.sides``).
+"""Fits the network that corrects estimates by the sides of their boxes (``models.refiner``).
 
 Both stages are trained and stay as they are. They read generated frames; what they are off by there
 is regressed on what the points say about their boxes, with the L1 losses of Eqs 17 to 21.

@@ -1,0 +1,341 @@
+"""The commands in a row: generate, train, fine-tune, evaluate, estimate, on a tiny model."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import types
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from caper_jax import categories, cli
+from caper_jax.config import LoaderConfig, to_dict, update
+from caper_jax.errors import CaperError
+from caper_jax.models.files import read_model, write_card, write_model
+from caper_jax.training import train as run
+from caper_jax.visualization.curves import training_curves
+
+ROOT = Path(__file__).resolve().parents[2]
+# A batch that no eight devices can share: compiling for one is faster.
+TINY = ["--category", "box", "--config", str(ROOT / "configs" / "debug.toml")]
+TINY += ["--set", "training.batch_size=3"]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """A model directory trained for a few steps."""
+    folder = tmp_path_factory.mktemp("run") / "box"
+    assert cli.main(["train", *TINY, "--steps", "10", "--out", str(folder)]) == 0
+    return folder
+
+
+def test_a_run_leaves_a_model_with_its_card(model):
+    card, variables = read_model(model)
+    assert card["category"] == "box" and card["steps"] == 10 and card["samples"] == 30
+    assert card["run"]["network"]["num_points"] == 128
+    assert set(variables["params"]) == {"root", "parts"}
+    assert np.shape(card["mean_pose"]["rotation"]) == (3, 3)
+    lines = [json.loads(line) for line in (model / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [5, 10]
+    assert all(math.isfinite(line["loss"]) and line["skipped"] == 0 for line in lines)
+    assert (model / "curves.png").stat().st_size > 10_000
+    lines[0]["root_deg"] = None  # a line of skipped steps
+    drawn = training_curves("title", lines).lines
+    np.testing.assert_array_equal(drawn["root [deg]"], [[10], [lines[1]["root_deg"]]])
+    np.testing.assert_array_equal(drawn["loss"], [[5, 10], [line["loss"] for line in lines]])
+
+
+def test_a_file_feeds_a_run_that_resumes_where_it_was(tmp_path, capsys):
+    """Ten steps in one go, and again from the fourth on, end with the same weights."""
+    file = tmp_path / "box.h5"
+    make = ["generate", "--category", "box", "--split", "train", "--frames", "7", "--grid", "24"]
+    assert cli.main([*make, "--points", "256", "--out", str(file)]) == 0
+    feed = ["train", *TINY, "--set", "training.checkpoint_steps=4", "--data", str(file)]
+    steps = ["--steps", "10", "--out"]
+    assert cli.main([*feed, *steps, str(tmp_path / "one")]) == 0
+    card, variables = read_model(tmp_path / "one")
+    assert card["run"]["loader"]["root"] == str(file) and card["steps"] == 10
+
+    for step in ("8", "10"):  # as if killed after step 4
+        shutil.rmtree(tmp_path / "one" / "checkpoints" / step)
+    (tmp_path / "one" / "weights.npz").unlink()
+    assert cli.main([*feed, *steps, str(tmp_path / "one")]) == 0
+    jax.tree.map(np.testing.assert_array_equal, read_model(tmp_path / "one")[1], variables)
+
+    capsys.readouterr()
+    assert cli.main([*feed, "--split", "val", *steps, str(tmp_path / "three")]) == 2
+    assert "holds split 'train', not 'val'" in capsys.readouterr().err
+    assert cli.main(["train", *TINY, "--format", "caper", *steps, str(tmp_path / "four")]) == 2
+    assert "--format goes with --data" in capsys.readouterr().err
+
+
+def test_a_run_that_ended_leaves_its_model_as_it_is(model, monkeypatch):
+    """What was fitted afterwards would be lost; only where the end was cut short is it repeated."""
+    card = read_model(model)[0]
+    assert card["complete"]
+    mine = {**card, "calibration": {"mine": 1}}
+    write_card(model, mine)
+    again = ["train", *TINY, "--steps", "10", "--out", str(model)]
+    assert cli.main(again) == 0
+    assert read_model(model)[0] == mine
+    write_card(model, {**mine, "complete": None})
+    assert cli.main(again) == 0
+    assert read_model(model)[0] == card
+
+
+def test_other_processes_wait_until_the_model_is_whole(tmp_path, monkeypatch):
+    """One that ended while the first still fits sides and confidence would take the run down."""
+    agree, whole = run.parallel.agree, []
+
+    def waiting(values):
+        card = tmp_path / "model.json"
+        whole.append(card.is_file() and "complete" in read_model(tmp_path)[0])
+        return agree(values)
+
+    monkeypatch.setattr(run.parallel, "agree", waiting)
+    assert cli.main(["train", *TINY, "--steps", "2", "--out", str(tmp_path)]) == 0
+    assert whole[-1] and not any(whole[:-1])
+
+
+def test_a_run_replaces_the_model_of_another_run(model, tmp_path):
+    for name in ("weights.npz", "model.json"):  # complete, and of as many steps
+        shutil.copy(model / name, tmp_path)
+    other = ["train", *TINY, "--steps", "10", "--seed", "3", "--out", str(tmp_path)]
+    assert cli.main(other) == 0
+    card, first = read_model(tmp_path)[0], read_model(model)[0]
+    assert card["run"]["training"]["seed"] == 3 and card["complete"] != first["complete"]
+
+
+def test_settings_of_the_loader_stand_beside_data(tmp_path, monkeypatch, capsys):
+    configs = []
+    ended = types.SimpleNamespace(finished=False, state=types.SimpleNamespace(step=0))
+    monkeypatch.setattr(run, "train", lambda config, *_: configs.append(config) or ended)
+    file = tmp_path / "mine.toml"
+    file.write_text('[loader]\nformat = "artimage"\nroot = "there"\nworkers = 7\n')
+    begin = ["train", "--category", "box", "--out", str(tmp_path / "run")]
+    data = ["--config", str(file), "--data", "here", "--set", "loader.prefetch=9"]
+    assert cli.main([*begin, *data]) == 130
+    assert configs[0].loader == LoaderConfig("artimage", "here", workers=7, prefetch=9)
+    assert cli.main([*begin, *data, "--format", "caper", "--split", "val"]) == 130
+    assert configs[1].loader == replace(configs[0].loader, format="caper", split="val")
+    file.write_text("[loader]\nworkers = 7\n")
+    assert cli.main([*begin, *data]) == 130
+    assert configs[2].loader == replace(configs[0].loader, format="caper")
+    assert cli.main([*begin, "--set", "loader.workers=7"]) == 2
+    assert "--set loader.* goes with --data" in capsys.readouterr().err
+
+
+def test_another_configuration_in_the_same_folder_is_refused(model, capsys):
+    arguments = ["train", *TINY, "--set", "loss.state_penalty=7", "--steps", "10"]
+    assert cli.main([*arguments, "--out", str(model)]) == 2
+    assert "state_penalty" in capsys.readouterr().err
+
+
+def test_evaluate_and_estimate_take_the_model(model, tmp_path, capsys):
+    file, results = tmp_path / "test.h5", tmp_path / "results"
+    common = ["--category", "box", "--frames", "5", "--instances", "3"]
+    arguments = ["--grid", "24", "--points", "256", "--noise", "none", "--out", str(file)]
+    assert cli.main(["generate", *common, *arguments]) == 0
+    assert cli.main(["generate", *common, *arguments]) == 2  # refuses to overwrite
+    assert str(file) in capsys.readouterr().err
+
+    evaluate = ["evaluate", "--category", "box", "--data", str(file), "--format", "caper"]
+    evaluate += ["--weights", str(model), "--out", str(results)]
+    assert cli.main(evaluate) == 0
+    metrics = json.loads((results / "metrics.json").read_text())
+    assert metrics["frames"] == 5 and metrics["failures"] == 0
+    arrays = np.load(results / "predictions.npz")
+    assert arrays["R"].shape == (5, 2, 3, 3)
+    # The printed means can be recomputed from the file.
+    cosine = (np.einsum("fkij,fkij->fk", arrays["R"], arrays["truth_R"]) - 1) / 2
+    degrees = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean(axis=0)
+    reported = [part["rotation_deg"]["mean"] for part in metrics["parts"]]
+    np.testing.assert_allclose(degrees, reported, rtol=1e-3)
+
+    points = tmp_path / "cloud.npy"
+    np.save(points, np.random.default_rng(0).normal((0, 0, 0.7), 0.1, (500, 3)))
+    out = tmp_path / "pose.json"
+    estimate = ["estimate", "--category", "box", "--points", str(points), "--json", str(out)]
+    assert cli.main([*estimate, "--weights", str(model)]) == 0
+    assert np.shape(json.loads(out.read_text())["pose"]["rotation"]) == (2, 3, 3)
+
+
+def test_a_model_can_start_another_run(model, tmp_path):
+    folder = tmp_path / "more"
+    arguments = ["train", *TINY, "--from", str(model), "--steps", "10"]
+    assert cli.main([*arguments, "--out", str(folder)]) == 0
+    card, variables = read_model(folder)
+    assert card["started_from"]["steps"] == 10 and card["steps"] == 10
+    assert "run" not in card["started_from"]
+    assert (
+        card["samples_in_all"] == 2 * card["samples"] == 20 * card["run"]["training"]["batch_size"]
+    )
+    # Ten small steps from there, not from anywhere.
+    moved = [
+        np.abs(leaf - start).max()
+        for leaf, start in zip(
+            jax.tree.leaves(variables["params"]),
+            jax.tree.leaves(read_model(model)[1]["params"]),
+            strict=True,
+        )
+    ]
+    assert 0 < max(moved) < 0.1
+
+
+def test_a_model_can_be_averaged_with_what_it_becomes(model, tmp_path, capsys):
+    begin = ["train", *TINY, "--steps", "10", "--from", str(model)]
+    for name, share in (("whole", 0.0), ("mixed", 0.75)):
+        out = ["--set", f"init_weight_average={share}", "--out", str(tmp_path / name)]
+        assert cli.main([*begin, *out]) == 0
+    first, whole, mixed = (
+        read_model(at)[1] for at in (model, tmp_path / "whole", tmp_path / "mixed")
+    )
+    expected = jax.tree.map(lambda a, b: 0.75 * a + 0.25 * b, first, whole)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-3, atol=1e-4), mixed, expected)
+    moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), first, whole)
+    assert max(jax.tree.leaves(moved)) > 0.01
+
+    # What the first model lacked was random there: it is as trained.
+    new = {"params": {"head": {"kernel": np.ones(3, np.float32)}}}
+    jax.tree.map(np.testing.assert_array_equal, run.averaged(first, new, 0.75), new)
+
+    no_start = ["train", *TINY, "--steps", "10", "--set", "init_weight_average=0.5"]
+    assert cli.main([*no_start, "--out", str(tmp_path / "none")]) == 2
+    assert (
+        "init_weight_average = 0.5 needs a model of 'box' to start from" in capsys.readouterr().err
+    )
+    with pytest.raises(CaperError, match=r"init_weight_average must be in \[0, 1\), got 1.0"):
+        replace(run.preset("fast", "box"), init_weight_average=1.0)
+
+
+def test_a_run_from_a_model_has_its_network(model, tmp_path, monkeypatch):
+    def configured(*options):
+        configs = []
+        ended = types.SimpleNamespace(finished=False, state=types.SimpleNamespace(step=0))
+        monkeypatch.setattr(run, "train", lambda config, *_: configs.append(config) or ended)
+        begin = ["train", "--category", "laptop", "--from", str(model), "--out", str(tmp_path)]
+        assert cli.main([*begin, *options]) == 130
+        return configs[0]
+
+    whole = configured()
+    sizes = read_model(model)[0]["run"]["network"]
+    assert whole.category == "laptop" and to_dict(whole.network) == sizes
+    assert whole.data.num_points == sizes["num_points"] == 128
+    fast = run.preset("fast", "laptop")
+    assert whole.loss == fast.loss and whole.training == fast.training
+    wider = configured("--set", "network.fast.width=24").network
+    assert wider == replace(whole.network, fast=replace(whole.network.fast, width=24))
+    assert configured("--preset", "paper") == run.preset("paper", "laptop")
+
+
+def test_a_run_from_a_published_network_is_of_that_preset(tmp_path):
+    network = {"encoder": "hs", "corrections": 2}
+    write_model(tmp_path, {}, {"run": {"network": network}})
+    config = run.preset_of(tmp_path, "box")
+    paper = run.preset("paper", "box")
+    assert config == replace(paper, network=replace(paper.network, refine_steps=2))
+
+
+def test_all_categories_one_after_the_other(model, tmp_path, monkeypatch):
+    shutil.copytree(model, tmp_path / "models")
+    shutil.copytree(model, tmp_path / "models" / "drawer")
+    called = []
+
+    def train(config, directory, initial):
+        called.append((config.category, config.training.minutes, directory, initial))
+        finished = config.category != "laptop"
+        return types.SimpleNamespace(finished=finished, state=types.SimpleNamespace(step=7))
+
+    monkeypatch.setattr(run, "train", train)
+    arguments = ["train", "--category", "all", "--from", str(tmp_path / "models")]
+    assert cli.main([*arguments, "--minutes", "2", "--out", str(tmp_path)]) == 130
+    names = categories.names()
+    assert [call[0] for call in called] == list(names[: names.index("laptop") + 1])
+    for name, minutes, directory, initial in called:
+        own = tmp_path / "models" / "drawer" if name == "drawer" else tmp_path / "models"
+        assert (minutes, directory, initial) == (2, tmp_path / name, own)
+
+
+def test_a_model_of_another_category_gives_its_encoders():
+    def variables(outputs, width, fill):
+        sizes = {"encoder": (3, width), "state": (width, 4), "size": (4, outputs)}
+        layers = {name: np.full(shape, fill, np.float32) for name, shape in sizes.items()}
+        return {"params": {"parts": {name: {"kernel": k} for name, k in layers.items()}}}
+
+    begin, stored = variables(6, 5, 0.0), variables(3, 5, 1.0)
+    start = run.initial_variables(begin, stored, "there", same_category=False)
+    parts = start["params"]["parts"]
+    np.testing.assert_array_equal(parts["encoder"]["kernel"], 1.0)
+    np.testing.assert_array_equal(parts["state"]["kernel"], np.zeros((5, 4)))
+    np.testing.assert_array_equal(parts["size"]["kernel"], np.zeros((4, 6)))
+    for other, same in ((variables(6, 7, 1.0), False), (stored, True)):
+        with pytest.raises(CaperError, match="there: its weights are of another network"):
+            run.initial_variables(begin, other, "there", same_category=same)
+
+
+def test_a_model_of_another_network_cannot(model, tmp_path, capsys):
+    arguments = ["train", *TINY, "--set", "network.fast.width=8", "--from", str(model)]
+    assert cli.main([*arguments, "--steps", "5", "--out", str(tmp_path / "no")]) == 2
+    assert str(model) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "configs").glob("*.toml")))
+def test_every_configuration_file_is_valid(name):
+    base = run.preset("paper" if name == "paper" else "fast", "box")
+    assert update(base, ROOT / "configs" / f"{name}.toml").category == "box"
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("calibration_frames=100", "calibration needs 320 frames or more, got 100"),
+        ("sides_frames=500", "fitting sides needs 1024 frames or more, got 500"),
+        ("network.fast.width=0", "network.fast.width must be at least 1, got 0"),
+        ("network.fast.scales=[0.1, 0.0]", "network.fast.scales must be at least 0.001"),
+        ("network.fast.scales=[]", "network.fast.scales must not be empty"),
+        (
+            "network.rotation_classifier.margin=nan",
+            "network.rotation_classifier.margin must be at least 0, got nan",
+        ),
+        ("network.point_heads.dropout=1.0", "network.point_heads.dropout must be below 1, got 1.0"),
+        ("network.root_heads.widths=[0,1,1]", "network.root_heads.widths must be at least 1"),
+        ("network.point_stride=200", "network.point_stride must be at most network.num_points"),
+        ("loss.state_penalty=inf", "loss.state_penalty must be finite and at least 0, got inf"),
+        (
+            "network.rotation_classifier.width=-1",
+            "network.rotation_classifier.width must be at least 0, got -1",
+        ),
+        ("loss.weights.twist=-1", "loss.weights.twist must be at least 0, got -1.0"),
+        ("loss.root_noise=nan", "loss.root_noise must be at least 0, got nan"),
+        ("loss.turned=1.5", "loss.turned is a fraction from 0 to 1, got 1.5"),
+        ("category=drawer", "--category says box, the configuration drawer"),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_a_run_begins(setting, message, tmp_path, capsys):
+    arguments = ["train", *TINY, "--set", "network.refiner.width=16", "--set", setting]
+    assert cli.main([*arguments, "--steps", "1", "--out", str(tmp_path / "run")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_calibrate_counts_frames_before_it_changes_a_model(model, capsys):
+    before = {path.name: path.read_bytes() for path in model.iterdir() if path.is_file()}
+    arguments = ["calibrate", "--category", "box", "--weights", str(model)]
+    assert cli.main([*arguments, "--sides", "1024", "--frames", "100"]) == 2
+    assert "calibration needs 320 frames or more" in capsys.readouterr().err
+    assert before == {path.name: path.read_bytes() for path in model.iterdir() if path.is_file()}
+
+
+def test_unknown_key_names_the_nearest(tmp_path, capsys):
+    file = tmp_path / "wrong.toml"
+    file.write_text("[training]\nlerning_rate = 1e-3\n")
+    arguments = ["train", "--category", "box", "--config", str(file), "--steps", "1"]
+    assert cli.main([*arguments, "--out", str(tmp_path / "run")]) == 2
+    message = capsys.readouterr().err
+    assert "learning_rate" in message and str(file) in message and message.count("\n") == 1
