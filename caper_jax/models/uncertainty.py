@@ -3,8 +3,8 @@
 Beyond the paper, whose correction factors (Eq 18) say how good the two directions of the root are
 and nothing of the other parts. What the networks say about a frame anyway, its evidence, gives for
 each part and joint the radius that holds the truth nine times in ten: a linear model of the
-logarithm, fitted once per category (``training.fit_uncertainty``). A standard deviation is the radius
-over that of a normal distribution of the same coverage.
+logarithm, fitted once per category (``training.fit_uncertainty``). A standard deviation is the
+radius over that of a normal distribution of the same coverage.
 """
 
 from __future__ import annotations

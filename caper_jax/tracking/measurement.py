@@ -37,8 +37,8 @@ class PoseMeasurement:
       labels: [N] int32 part of every point.
       constants: joint parameters and sizes.
       sure: [] in [0, 1], the lesser confidence of the root's two directions (Eq 18); 1 of a track.
-      turn: [24] log odds that the reference is off by each turn of ``models.rotation_classes``; zero where
-        nothing says so.
+      turn: [24] log odds that the reference is off by each rotation of
+        ``models.rotation_classes``; zero where nothing says so.
     """
 
     root: Any

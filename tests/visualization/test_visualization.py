@@ -13,8 +13,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from _helpers._x import AXIS, PIVOT, STATE, part_poses
-from _helpers.arm import ARM, ROOT, arm_pose
+from _helpers.arm import ARM, AXIS, PIVOT, ROOT, STATE, arm_pose, part_poses
 from matplotlib.figure import Figure
 from PIL import Image
 
