@@ -184,14 +184,12 @@ def _twice(call: Callable[[], Any]) -> Callable[[], Any]:
 def _draw(path: Path, rows: Sequence[Mapping[str, Any]], category: str) -> None:
     """One bar per chain, a segment per stage."""
     from matplotlib import colormaps
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from caper_jax.visualization.figures import save_figure
+    from caper_jax.visualization.plots import save_figure
 
     chains = list(dict.fromkeys(row["chain"] for row in rows))
     figure = Figure(figsize=(9, 1.2 + 1.9 * len(chains)), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.subplots(len(chains), 1, squeeze=False)[:, 0]
     for axes, chain in zip(grid, chains, strict=True):
         own = [row for row in rows if row["chain"] == chain]

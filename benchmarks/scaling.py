@@ -75,14 +75,12 @@ def _measure(preset: str, points: int, parts: int, batch: int, repeats: int) -> 
 
 def _draw(path: Path, rows: Sequence[dict[str, Any]], preset: str) -> None:
     """Time and memory over each size, on logarithmic axes."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from caper_jax.visualization.figures import save_figure
+    from caper_jax.visualization.plots import save_figure
 
     names = list(dict.fromkeys(row["varied"] for row in rows))
     figure = Figure(figsize=(3.6 * len(names), 5.2), layout="constrained")
-    FigureCanvasAgg(figure)
     quantities = (("ms", "time [ms]"), ("memory_MB", "memory [MB]"))
     grid = figure.subplots(len(quantities), len(names), squeeze=False)
     for column, name in enumerate(names):

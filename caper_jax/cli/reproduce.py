@@ -15,7 +15,7 @@ from caper_jax.machine import machine as describe_machine
 
 if TYPE_CHECKING:
     from caper_jax.reproduce.options import Options
-    from caper_jax.reproduce.render import Report
+    from caper_jax.reproduce.report import Report
 
 _TRACKING = (
     *("category", "videos", "frames", "mode", "data", "format", "split", "weights", "seed"),
@@ -61,7 +61,7 @@ REPRODUCTIONS = {
     "figure11": Reproduction(
         "root_pose", "rotation decoupled or regressed directly; trains both", _TRAINED
     ),
-    "table8": Reproduction("occlusion", "pose estimation by how much is hidden", _STATIC),
+    "table8": Reproduction("static", "pose estimation by how much is hidden", _STATIC),
     "table4": Reproduction(
         "tracking", "pose tracking, ReArt-Videos categories", (*_TRACKING, "given_masks")
     ),
@@ -72,7 +72,7 @@ REPRODUCTIONS = {
         "tracking", "pose tracking, PM-Videos categories", (*_TRACKING, "given_masks")
     ),
     "table9": Reproduction(
-        "increments",
+        "ablations",
         "Lie against Euclidean increments; trains both",
         (
             *("category", "videos", "frames", "mode", "data", "format", "split", "seed", "noise"),
@@ -83,10 +83,10 @@ REPRODUCTIONS = {
         "keyframes", "keyframes none, fixed or dynamic; error against frame", _TRACKING
     ),
     "reliability": Reproduction(
-        "reliability", "how often the truth lies where the model says", _STATIC
+        "static", "how often the truth lies where the model says", _STATIC
     ),
-    "jitter": Reproduction("jitter", "trembling on an object that stands still", _MOVING),
-    "modes": Reproduction("modes", "errors by how camera and joints move", _MOVING),
+    "jitter": Reproduction("motion", "jitter on an object that stands still", _MOVING),
+    "modes": Reproduction("motion", "errors by how camera and joints move", _MOVING),
 }
 
 # Field of ``Options`` -> its arguments to argparse.
@@ -231,7 +231,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = vars(build_parser().parse_args(sys.argv[1:] if argv is None else argv))
     name = arguments.pop("reproduction")
     from caper_jax.reproduce.options import Options
-    from caper_jax.reproduce.render import markdown, write_report
+    from caper_jax.reproduce.report import markdown, write_report
 
     values: dict[str, Any] = {
         key: tuple(v) if isinstance(v, list) else v for key, v in arguments.items()
@@ -256,14 +256,8 @@ def _with_machine(report: Report) -> Report:
 
 
 def _write_curves(options: Options, name: str, report: Report) -> list[Path]:
-    """Writes the report's pictures; returns their paths."""
-    from caper_jax.reproduce.render import Curves
-    from caper_jax.visualization.curves import write_curves, write_scatter
+    """Writes the report's plots; returns their paths."""
+    from caper_jax.visualization.plots import write_plot
 
-    paths = {options.out / f"{name}_{end}.png": curves for end, curves in report.curves.items()}
-    for path, curves in paths.items():
-        if isinstance(curves, Curves):
-            write_curves(path, curves)
-        else:
-            write_scatter(path, curves)
-    return list(paths)
+    paths = {options.out / f"{name}_{end}.png": plot for end, plot in report.curves.items()}
+    return [write_plot(path, plot) for path, plot in paths.items()]

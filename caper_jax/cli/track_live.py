@@ -13,7 +13,7 @@ import numpy as np
 
 from caper_jax.data.live import LiveFrame, Newest, read_frames
 from caper_jax.errors import CaperError
-from caper_jax.evaluation.track_report import frame_record, json_line
+from caper_jax.evaluation.records import frame_record, json_line
 from caper_jax.tracker import Tracker
 
 _CONNECT_S = 10.0

@@ -20,9 +20,15 @@ from caper_jax.data.readers.depth_folder import DepthFolder, is_depth_folder
 from caper_jax.data.types import Dataset, Frame
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.estimator import load
+from caper_jax.evaluation.records import json_line
 from caper_jax.evaluation.report import METRICS_FILE
-from caper_jax.evaluation.track_report import format_tracks, json_line, track_records
-from caper_jax.evaluation.tracking import Track, summarize_tracks, track_video
+from caper_jax.evaluation.tracking import (
+    Track,
+    format_tracks,
+    summarize_tracks,
+    track_records,
+    track_video,
+)
 from caper_jax.files import write_atomically
 from caper_jax.progress import Progress, progress
 from caper_jax.tracker import Tracker, config_for

@@ -130,12 +130,12 @@ def _plot(category: str, out: Path) -> None:
     import jax
 
     from caper_jax.training.metrics_log import FILE, read_metrics
-    from caper_jax.visualization.curves import training_curves, write_curves
+    from caper_jax.visualization.plots import training_curves, write_plot
 
     if jax.process_index() or not (out / FILE).is_file():
         return
     if rows := read_metrics(out / FILE):
-        write_curves(out / "curves.png", training_curves(f"Training of {category}", rows))
+        write_plot(out / "curves.png", training_curves(f"Training of {category}", rows))
 
 
 def _configuration(category: str, arguments: argparse.Namespace, initial: Path | None) -> RunConfig:

@@ -1,7 +1,7 @@
 """Errors of estimated poses, frame by frame, as the conventions define them.
 
 Everything is computed in float64; rotations by the atan2 form, so that the ground truth scored
-against itself reads 0 degrees, 0 meters and an IoU of 1.
+against itself scores 0 degrees, 0 meters and an IoU of 1.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
@@ -21,7 +22,7 @@ from caper_jax.geometry import boxes
 from caper_jax.lie import linalg, so3
 
 FAILED_ROTATION_DEG = 180.0
-# What a frame without an estimate scores, in the words of the report.
+# What a frame without an estimate scores, as the report says it.
 FAILURE_VALUES = {
     "rotation_deg": FAILED_ROTATION_DEG,
     "translation_m": "distance of the true part origin from the camera",
@@ -49,14 +50,14 @@ class PoseErrors:
       state: [F, J] degrees (revolute) or meters (prismatic).
     """
 
-    rotation_deg: np.ndarray
-    translation_m: np.ndarray
-    translation_relative: np.ndarray
-    iou_full: np.ndarray
-    iou_size: np.ndarray
-    axis_deg: np.ndarray
-    pivot_m: np.ndarray
-    state: np.ndarray
+    rotation_deg: Float[np.ndarray, "frames parts"]
+    translation_m: Float[np.ndarray, "frames parts"]
+    translation_relative: Float[np.ndarray, "frames parts"]
+    iou_full: Float[np.ndarray, "frames parts"]
+    iou_size: Float[np.ndarray, "frames parts"]
+    axis_deg: Float[np.ndarray, "frames joints"]
+    pivot_m: Float[np.ndarray, "frames joints"]
+    state: Float[np.ndarray, "frames joints"]
 
 
 PART_METRICS = ("rotation_deg", "translation_m", "translation_relative", "iou_full", "iou_size")
@@ -67,7 +68,7 @@ def pose_errors(
     estimate: ArticulatedPose,
     truth: ArticulatedPose,
     category: Category,
-    failed: np.ndarray | None = None,
+    failed: Bool[np.ndarray, " frames"] | None = None,
 ) -> PoseErrors:
     """Errors of estimates against the truth, without regard to symmetries.
 
@@ -81,9 +82,9 @@ def pose_errors(
       CaperError: estimates of other shapes than the truth, or not finite although not failed.
     """
     none = np.zeros(len(truth.rotation), bool)
-    lost = none if failed is None else np.asarray(failed, bool)
+    failed = none if failed is None else np.asarray(failed, bool)
     true = _as_double(truth, "truth", category, none)
-    guess = _as_double(estimate, "estimate", category, lost)
+    guess = _as_double(estimate, "estimate", category, failed)
 
     with jax.enable_x64(True):
         errors = {key: np.array(value) for key, value in _errors(guess, true).items()}
@@ -92,13 +93,13 @@ def pose_errors(
     errors["state"][:, revolute] = np.degrees(errors["state"][:, revolute])
 
     for key in ("rotation_deg", "axis_deg"):
-        errors[key][lost] = FAILED_ROTATION_DEG
+        errors[key][failed] = FAILED_ROTATION_DEG
     for key in ("iou_full", "iou_size"):
-        errors[key][lost] = 0.0
-    errors["translation_m"][lost] = np.linalg.norm(true["translation"], axis=-1)[lost]
-    errors["pivot_m"][lost] = np.where(revolute, _axis_distance(true), np.nan)[lost]
+        errors[key][failed] = 0.0
+    errors["translation_m"][failed] = np.linalg.norm(true["translation"], axis=-1)[failed]
+    errors["pivot_m"][failed] = np.where(revolute, _axis_distance(true), np.nan)[failed]
     widths = np.array([joint.limits[1] - joint.limits[0] for joint in category.joints])
-    errors["state"][lost] = np.where(revolute, np.degrees(widths), widths)
+    errors["state"][failed] = np.where(revolute, np.degrees(widths), widths)
     errors["translation_relative"] = errors["translation_m"] / object_diagonal(truth)[:, None]
     return PoseErrors(**errors)
 
@@ -107,33 +108,33 @@ def pose_errors_up_to_symmetry(
     estimate: ArticulatedPose,
     truth: ArticulatedPose,
     category: Category,
-    failed: np.ndarray | None = None,
+    failed: Bool[np.ndarray, " frames"] | None = None,
 ) -> PoseErrors:
-    """Errors against the better of the category's declared readings of the truth.
+    """Errors against the better of the truths that the category declares equivalent.
 
-    Better is the reading, frame by frame, whose root is turned less from the estimate's; all
-    errors of the frame are those against that reading. An instance whose exchanged parts are not
-    alike (``Symmetry.tolerance``) has one reading.
+    Better is, frame by frame, the truth whose root's rotation is nearer to the estimate's; all
+    errors of the frame are those against that truth. An instance whose exchanged parts are not
+    alike (``Symmetry.tolerance``) has one truth only.
 
     Args and errors as for ``pose_errors``.
     """
-    readings = [truth, *(apply_symmetry(truth, e, category) for e in category.symmetries)]
-    scores = [pose_errors(estimate, reading, category, failed) for reading in readings]
-    turns = [score.rotation_deg[:, 0] for score in scores]
+    truths = [truth, *(apply_symmetry(truth, s, category) for s in category.symmetries)]
+    errors = [pose_errors(estimate, one, category, failed) for one in truths]
+    angles = [error.rotation_deg[:, 0] for error in errors]
     for number, symmetry in enumerate(category.symmetries, start=1):
         alike = np.asarray(is_ambiguous(np.asarray(truth.size), symmetry))
-        turns[number] = np.where(alike, turns[number], np.inf)
-    best = np.argmin(turns, axis=0)
+        angles[number] = np.where(alike, angles[number], np.inf)
+    best = np.argmin(angles, axis=0)
     frames = np.arange(len(best))
     return PoseErrors(
         **{
-            field.name: np.stack([getattr(score, field.name) for score in scores])[best, frames]
+            field.name: np.stack([getattr(error, field.name) for error in errors])[best, frames]
             for field in fields(PoseErrors)
         }
     )
 
 
-def object_diagonal(pose: ArticulatedPose) -> np.ndarray:
+def object_diagonal(pose: ArticulatedPose) -> Float[np.ndarray, " frames"]:
     """[F] meters, diagonal of the box around all parts at rest."""
     half = np.asarray(pose.size, np.float64) / 2
     center = np.asarray(pose.box_center, np.float64)
@@ -181,17 +182,17 @@ def _axis_distance(arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _as_double(
-    pose: ArticulatedPose, name: str, category: Category, lost: np.ndarray
+    pose: ArticulatedPose, name: str, category: Category, failed: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Fields [F, ...] in float64; failed frames get a harmless pose, which is not used."""
     arrays = {}
     for key, shape in pose_shapes(category.num_parts).items():
         array = np.array(getattr(pose, key), np.float64)
-        if array.shape != (len(lost), *shape):
+        if array.shape != (len(failed), *shape):
             raise CaperError(
-                f"{name} {key} has shape {array.shape}, expected {(len(lost), *shape)}"
+                f"{name} {key} has shape {array.shape}, expected {(len(failed), *shape)}"
             )
-        array[lost] = np.eye(3) if key == "rotation" else 1.0
+        array[failed] = np.eye(3) if key == "rotation" else 1.0
         if not np.isfinite(array).all():
             raise CaperError(f"{name} {key} has NaN or infinite entries")
         arrays[key] = array

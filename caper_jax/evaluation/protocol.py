@@ -1,4 +1,4 @@
-"""Runs a predictor over a dataset: what is asked of it, in which batches, and what counts."""
+"""Runs a predictor over a dataset: what it is given, in which batches, and what counts."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Float32
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
@@ -43,8 +44,8 @@ class Evaluation:
     names: list[str]
     estimate: ArticulatedPose
     truth: ArticulatedPose
-    failed: np.ndarray
-    visibility: np.ndarray
+    failed: Bool[np.ndarray, " frames"]
+    visibility: Float[np.ndarray, "frames parts"]
     seconds_per_frame: float
 
 
@@ -75,15 +76,14 @@ def evaluate(
     truths: list[ArticulatedPose] = []
     visibility: list[np.ndarray] = []
     unknown = np.full(dataset.category.num_parts, np.nan)
-    seconds, warm = 0.0, False
+    seconds = 0.0
     with progress("evaluating", total=count) as bar:
         for start in range(0, count, batch_size):
             frames = [dataset[i] for i in range(start, min(start + batch_size, count))]
             padded = frames + [frames[-1]] * (batch_size - len(frames))
             clouds = np.stack([cloud_of(frame, num_points) for frame in padded])
-            if not warm:
-                predictor(padded, clouds)
-                warm = True
+            if start == 0:
+                predictor(padded, clouds)  # compiles
             began = time.perf_counter()
             batch = jax.tree.map(np.asarray, predictor(padded, clouds))
             seconds += time.perf_counter() - began
@@ -116,7 +116,7 @@ def model_predictor(estimator: Callable[[np.ndarray], Any]) -> Predictor:
 
 
 def truth_predictor(frames: Sequence[Frame], points: np.ndarray) -> ArticulatedPose:
-    """The dataset's own ground truth: whatever it does not score perfectly is our mistake."""
+    """The dataset's own ground truth, which must score perfectly: else the metrics are wrong."""
     return _stack([frame.truth for frame in frames if frame.truth is not None])
 
 
@@ -141,9 +141,7 @@ def mean_predictor(category: Category, mean_pose: Mapping[str, Any], source: str
     del shapes["translation"]
     values = {}
     for key, shape in shapes.items():
-        if key not in mean_pose:
-            raise CaperError(f"{source}: mean_pose lacks {key!r}")
-        values[key] = np.asarray(mean_pose[key], np.float32)
+        values[key] = np.asarray(mean_pose.get(key, np.nan), np.float32)
         if values[key].shape != shape or not np.isfinite(values[key]).all():
             raise CaperError(f"{source}: mean_pose {key} must be finite numbers {shape}")
 
@@ -165,7 +163,7 @@ def mean_predictor(category: Category, mean_pose: Mapping[str, Any], source: str
     return predict
 
 
-def cloud_of(frame: Frame, num_points: int) -> np.ndarray:
+def cloud_of(frame: Frame, num_points: int) -> Float32[np.ndarray, "points 3"]:
     """[N, 3] points that a predictor sees; some cloud where the frame shows too little to use."""
     if len(frame.points) < MIN_POINTS:
         return np.linspace((-0.1, -0.1, 0.9), (0.1, 0.1, 1.1), num_points, dtype=np.float32)

@@ -1,18 +1,20 @@
-"""What an evaluation leaves behind: metrics.json, predictions.npz and a table for people."""
+"""What an evaluation leaves behind: metrics.json, predictions.npz and a table as text."""
 
 from __future__ import annotations
 
 import io
 import json
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from tabulate import tabulate
 
 from caper_jax.articulation.category import Category
 from caper_jax.data.types import Dataset
-from caper_jax.evaluation.breakdown import by_occlusion, by_opening, format_bins
 from caper_jax.evaluation.metrics import (
     FAILURE_VALUES,
     JOINT_METRICS,
@@ -22,12 +24,28 @@ from caper_jax.evaluation.metrics import (
     pose_errors_up_to_symmetry,
 )
 from caper_jax.evaluation.protocol import Evaluation
-from caper_jax.evaluation.summaries import TURNED_DEG, align, cell, summary, turned
 from caper_jax.files import write_atomically
 
 METRICS_FILE = "metrics.json"
 PREDICTIONS_FILE = "predictions.npz"
-_STATE_UNITS = {"revolute": "degrees", "prismatic": "meters"}
+# Beyond this a rotation is taken to be flipped (another face taken for the front), not inaccurate.
+FLIPPED_DEG = 30.0
+STATE_UNITS = {"revolute": "degrees", "prismatic": "meters"}
+# Bins of paper Table 8: the share of a part that is occluded, low to high. (The paper defines its
+# level as the visible share, yet calls 80-100 % highly occluded and reports it as the worst.)
+_OCCLUSION = ((0.0, 0.4), (0.4, 0.8), (0.8, 1.0))
+# Closed objects look alike from several viewpoints: of a dishwasher's 90 deg, 4.5 are the first.
+_OPENING = ((0.0, 0.05), (0.05, 0.25), (0.25, 1.0))
+# Name in predictions.npz -> field of the pose.
+_ARRAYS = {
+    "R": "rotation",
+    "t": "translation",
+    "size": "size",
+    "box_center": "box_center",
+    "joint_axis": "joint_axis",
+    "joint_pivot": "joint_pivot",
+    "joint_state": "joint_state",
+}
 
 
 def summarize(
@@ -39,14 +57,14 @@ def summarize(
     "by_opening" holds the errors of frames in which the object is closed, ajar or open, where the
     category knows such a thing, and, where the data say how much of each part is visible,
     "by_occlusion" those of the parts within each bin of paper Table 8. For a category with declared
-    symmetries, "up_to_symmetry" holds the errors against the better reading of the truth; all the
-    others never do.
+    symmetries, "up_to_symmetry" holds the errors against the better of the equivalent truths; all
+    the others never do.
 
     Args:
       evaluation: from ``protocol.evaluate``.
       dataset: where the frames came from.
       predictor: "model", "truth" or "mean".
-      weights: the model, for people; None when none was used.
+      weights: names the model; None when none was used.
     """
     category = dataset.category
     arguments = (evaluation.estimate, evaluation.truth, category, evaluation.failed)
@@ -66,9 +84,9 @@ def summarize(
     }
     if category.closed:
         state = np.asarray(evaluation.truth.joint_state)
-        report["by_opening"] = by_opening(errors, state, category)
+        report["by_opening"] = errors_by_opening(errors, state, category)
     if not np.isnan(evaluation.visibility).all():
-        report["by_occlusion"] = by_occlusion(errors, evaluation.visibility, category)
+        report["by_occlusion"] = errors_by_occlusion(errors, evaluation.visibility, category)
     if category.symmetries:
         report["up_to_symmetry"] = {
             "reasons": [symmetry.reason for symmetry in category.symmetries],
@@ -80,33 +98,108 @@ def summarize(
 def error_tables(errors: PoseErrors, category: Category) -> dict[str, list[dict[str, Any]]]:
     """Mean and median of every error, per part and joint, JSON-ready.
 
-    Also "turned" of a part, the share of frames in which it is off by more than 30 deg.
+    Also "flipped" of a part: the share of frames whose rotation is off by more than 30 deg.
     """
+    every = np.ones(len(errors.rotation_deg), bool)
     parts = [
-        {
-            "name": name,
-            **{key: summary(getattr(errors, key)[:, k]) for key in PART_METRICS},
-            "turned": turned(errors.rotation_deg[:, k]),
-        }
-        for k, name in enumerate(category.parts)
+        {"name": name, **_part_errors(errors, part, every)}
+        for part, name in enumerate(category.parts)
     ]
     joints = [
         {
             "type": kind,
             **{key: summary(getattr(errors, key)[:, j]) for key in JOINT_METRICS},
-            "state_unit": _STATE_UNITS[kind],
+            "state_unit": STATE_UNITS[kind],
         }
         for j, kind in enumerate(category.joint_types)
     ]
     return {"parts": parts, "joints": joints}
 
 
+def errors_by_occlusion(
+    errors: PoseErrors, visibility: Float[np.ndarray, "frames parts"], category: Category
+) -> list[dict[str, Any]]:
+    """Errors of the parts by how much of them is hidden, JSON-ready.
+
+    Args:
+      errors: of F frames.
+      visibility: [F, K] visible share of each part, NaN where unknown.
+      category: names the parts.
+
+    Returns:
+      One entry per bin: "occluded" (its ends) and "parts", each with its name, the number of
+      frames within the bin and, if there are any, its errors in them.
+    """
+    return _bins(errors, 1.0 - visibility, _OCCLUSION, "occluded", category)
+
+
+def errors_by_opening(
+    errors: PoseErrors, state: Float[np.ndarray, "frames joints"], category: Category
+) -> list[dict[str, Any]]:
+    """Errors of the parts by how far the most open joint is open, as ``errors_by_occlusion``.
+
+    Args:
+      errors: of F frames.
+      state: [F, J] true joint states, radians or meters.
+      category: knows the joints' limits, between which the opening is a share, and which of them is
+        closed; states beyond count as the limit.
+    """
+    low, high = np.array([joint.limits for joint in category.joints]).T
+    opening = np.clip((state - low) / (high - low), 0.0, 1.0)
+    opening = 1.0 - opening if category.closed == "high" else opening
+    opening = opening.max(axis=1, keepdims=True)
+    opening = np.broadcast_to(opening, errors.rotation_deg.shape)
+    return _bins(errors, opening, _OPENING, "opened", category)
+
+
+def _bins(
+    errors: PoseErrors,
+    shares: np.ndarray,
+    bins: Sequence[tuple[float, float]],
+    key: str,
+    category: Category,
+) -> list[dict[str, Any]]:
+    # Rounded: files keep float32, whose 0.6 is a little more than 0.6.
+    shares = np.round(shares, 6)
+    result = []
+    for low, high in bins:
+        within = (shares >= low) & ((shares < high) | (high == 1.0))
+        parts = []
+        for part, name in enumerate(category.parts):
+            frames = within[:, part]
+            entry = {"name": name, "frames": int(frames.sum())}
+            parts.append(entry | (_part_errors(errors, part, frames) if frames.any() else {}))
+        result.append({key: [low, high], "parts": parts})
+    return result
+
+
+def _part_errors(errors: PoseErrors, part: int, frames: np.ndarray) -> dict[str, Any]:
+    """Summaries of one part's errors in the chosen frames [F] bool."""
+    table: dict[str, Any] = {
+        key: summary(getattr(errors, key)[frames, part]) for key in PART_METRICS
+    }
+    table["flipped"] = float(np.mean(errors.rotation_deg[frames, part] > FLIPPED_DEG))
+    return table
+
+
+def summary(values: Float[np.ndarray, " frames"]) -> dict[str, float | None]:
+    """Mean and median; None where the error has no meaning (pivots of prismatic joints)."""
+    if np.isnan(values).all():
+        return {"mean": None, "median": None}
+    # Nine digits: the truth's IoU is 1, not one rounding of float64 below it.
+    return {
+        "mean": float(f"{np.mean(values):.9g}"),
+        "median": float(f"{np.median(values):.9g}"),
+    }
+
+
 def write_report(folder: str | Path, evaluation: Evaluation, report: dict[str, Any]) -> None:
     """Writes metrics.json and predictions.npz, each whole or not at all.
 
     predictions.npz holds, for F frames in order, ``frame`` (names), ``failed`` [F] and the
-    estimates ``R`` [F, K, 3, 3], ``t``, ``size``, ``box_center`` [F, K, 3] (meters),
-    ``joint_axis``, ``joint_pivot`` [F, J, 3], ``joint_state`` [F, J] (radians or meters), NaN where
+    estimates ``R`` [F, K, 3, 3], ``t`` [F, K, 3] (part to camera, meters), ``size``,
+    ``box_center`` [F, K, 3] (rest frame of the part, meters), ``joint_axis``, ``joint_pivot``
+    [F, J, 3] (rest frame of the root), ``joint_state`` [F, J] (radians or meters), NaN where
     failed, and the ground truth under the same names with ``truth_`` before; ``visibility`` [F, K]
     is NaN where unknown. Every error in metrics.json can be computed from it.
 
@@ -121,15 +214,7 @@ def write_report(folder: str | Path, evaluation: Evaluation, report: dict[str, A
         "visibility": evaluation.visibility,
     }
     for prefix, pose in (("", evaluation.estimate), ("truth_", evaluation.truth)):
-        for name, key in (
-            ("R", "rotation"),
-            ("t", "translation"),
-            ("size", "size"),
-            ("box_center", "box_center"),
-            ("joint_axis", "joint_axis"),
-            ("joint_pivot", "joint_pivot"),
-            ("joint_state", "joint_state"),
-        ):
+        for name, key in _ARRAYS.items():
             arrays[prefix + name] = np.asarray(getattr(pose, key))
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]
@@ -140,22 +225,22 @@ def write_report(folder: str | Path, evaluation: Evaluation, report: dict[str, A
 
 
 def format_report(report: dict[str, Any]) -> str:
-    """The report as plain text, at most 80 columns: medians and means of parts and joints."""
+    """The report as plain text, at most 80 columns: means and medians of parts and joints."""
     lines = [
         f"{report['category']}, {report['format']} ({report['split']}): {report['frames']} frames, "
         f"{report['failures']} failed; predictor: {report['predictor']}",
         f"object masks: {report['mask_source']}; "
         f"{1000 * report['seconds_per_frame']:.1f} ms per frame",
-        "each cell: mean / median",
+        "errors: mean / median",
         "",
         *format_tables(report),
     ]
     if "by_opening" in report:
         lines += ["", "by how far the most open joint is open, of its limits:"]
-        lines += format_bins(report["by_opening"], "opened")
+        lines += _format_bins(report["by_opening"], "opened")
     if "by_occlusion" in report:
         lines += ["", "by the share of the part that is occluded:"]
-        lines += format_bins(report["by_occlusion"], "occluded")
+        lines += _format_bins(report["by_occlusion"], "occluded")
     if "up_to_symmetry" in report:
         symmetric = report["up_to_symmetry"]
         lines += ["", f"up to symmetry ({'; '.join(symmetric['reasons'])}):"]
@@ -165,29 +250,74 @@ def format_report(report: dict[str, Any]) -> str:
 
 def format_tables(tables: dict[str, Any]) -> list[str]:
     """Lines of the tables of parts and joints that ``error_tables`` gives, mean / median."""
-    rows = [["part", "rotation [deg]", "translation [mm]", "IoU full", "IoU size"]]
-    for part in tables["parts"]:
-        rows.append(
-            [
-                part["name"],
-                cell(part["rotation_deg"], 1, 2),
-                cell(part["translation_m"], 1000, 1),
-                cell(part["iou_full"], 1, 3),
-                cell(part["iou_size"], 1, 3),
-            ]
-        )
-    shares = ", ".join(f"{part['name']} {100 * part['turned']:.1f} %" for part in tables["parts"])
+    rows = [
+        [
+            part["name"],
+            format_error(part["rotation_deg"], 1, 2),
+            format_error(part["translation_m"], 1000, 1),
+            format_error(part["iou_full"], 1, 3),
+            format_error(part["iou_size"], 1, 3),
+        ]
+        for part in tables["parts"]
+    ]
+    lines = text_table(["part", "rotation [deg]", "translation [mm]", "IoU full", "IoU size"], rows)
+    shares = ", ".join(f"{part['name']} {100 * part['flipped']:.1f} %" for part in tables["parts"])
     # A column more, and the table would be too wide.
-    lines = [*align(rows), *textwrap.wrap(f"over {TURNED_DEG:.0f} deg: {shares}", 80), ""]
-    rows = [["joint", "axis [deg]", "pivot [mm]", "state"]]
-    for joint, part in zip(tables["joints"], tables["parts"][1:], strict=True):
-        meters = joint["state_unit"] == "meters"
-        rows.append(
-            [
-                f"{part['name']} ({joint['type']})",
-                cell(joint["axis_deg"], 1, 2),
-                cell(joint["pivot_m"], 1000, 1),
-                cell(joint["state"], 1000 if meters else 1, 2) + (" mm" if meters else " deg"),
-            ]
-        )
-    return lines + align(rows)
+    lines += textwrap.wrap(f"flipped (over {FLIPPED_DEG:.0f} deg): {shares}", 80)
+    rows = [
+        [f"{part['name']} ({joint['type']})", *format_joint(joint)]
+        for joint, part in zip(tables["joints"], tables["parts"][1:], strict=True)
+    ]
+    return [*lines, "", *text_table(["joint", "axis [deg]", "pivot [mm]", "state"], rows)]
+
+
+def _format_bins(bins: list[dict[str, Any]], key: str) -> list[str]:
+    rows = [
+        [
+            part["name"],
+            format_share(entry[key]),
+            str(part["frames"]),
+            format_error(part["rotation_deg"], 1, 2),
+            format_error(part["translation_m"], 1000, 1),
+        ]
+        for parts in zip(*(entry["parts"] for entry in bins), strict=True)
+        for entry, part in zip(bins, parts, strict=True)
+        if part["frames"]
+    ]
+    return text_table(["part", key, "frames", "rotation [deg]", "translation [mm]"], rows)
+
+
+def format_error(summary: dict[str, float | None], factor: float, digits: int) -> str:
+    """``mean / median`` in another unit; "-" where the error has no meaning."""
+    mean, median = summary["mean"], summary["median"]
+    if mean is None or median is None:
+        return "-"
+    return f"{factor * mean:.{digits}f} / {factor * median:.{digits}f}"
+
+
+def format_joint(joint: dict[str, Any]) -> list[str]:
+    """``mean / median`` of a joint of ``error_tables``: axis [deg], pivot [mm], state with unit."""
+    factor, unit = (1000.0, "mm") if joint["state_unit"] == "meters" else (1.0, "deg")
+    return [
+        format_error(joint["axis_deg"], 1.0, 2),
+        format_error(joint["pivot_m"], 1000.0, 1),
+        f"{format_error(joint['state'], factor, 2)} {unit}",
+    ]
+
+
+def format_share(ends: Sequence[float]) -> str:
+    """Both ends of a bin, in percent."""
+    return f"{100 * ends[0]:.0f}-{100 * ends[1]:.0f} %"
+
+
+def text_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table without rules; the first column to the left, the others to the right."""
+    text = tabulate(
+        rows,
+        header,
+        tablefmt="plain",
+        colalign=("left", *["right"] * (len(header) - 1)) if rows else None,
+        disable_numparse=True,
+        preserve_whitespace=True,  # indented names stand below what they belong to
+    )
+    return text.splitlines()

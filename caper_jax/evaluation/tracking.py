@@ -1,9 +1,9 @@
-"""Runs a tracker over labeled videos: how each begins, what is given, and what counts."""
+"""Runs a tracker over videos: how each begins, what is given, what counts, and what is written."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -12,19 +12,23 @@ import numpy as np
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.config import TrackerConfig
 from caper_jax.data.types import Frame
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.metrics import PoseErrors, pose_errors
-from caper_jax.evaluation.report import error_tables
+from caper_jax.evaluation.records import frame_record
+from caper_jax.evaluation.report import error_tables, format_tables, text_table
 from caper_jax.tracker import Tracker
+from caper_jax.tracking.step import TrackResult
 
 Start = Literal["truth", "estimator"]
 STARTS: tuple[Start, ...] = ("truth", "estimator")
+_NAME_WIDTH = 30  # of a video in a table
 
 
 @dataclass(frozen=True)
 class Track:
-    """What a tracker said about one video of T frames.
+    """The results of a tracker on one video of T frames.
 
     Attributes:
       name: the video's.
@@ -162,3 +166,85 @@ def summarize_tracks(
         "lost": int(after["lost"].sum()),
         "median_seconds_per_frame": float(np.median(after["seconds"])),
     }
+
+
+def track_records(track: Track, category: Category) -> Iterator[dict[str, Any]]:
+    """``frame_record`` of every frame of a track.
+
+    Raises:
+      CaperError: a pose that is not finite.
+    """
+    for index, frame in enumerate(track.frames):
+        result = TrackResult(
+            pose=jax.tree.map(lambda array, i=index: array[i], track.pose),
+            labels=None,
+            energy=track.energy[index],
+            keyframe=track.keyframe[index],
+            estimated=track.estimated[index],
+            lost=track.lost[index],
+        )
+        yield frame_record(frame, result, category, float(track.seconds[index]))
+
+
+def format_tracks(
+    tracks: Sequence[Track],
+    category: Category,
+    config: TrackerConfig,
+    start: Start,
+    mask_source: str,
+    part_masks: str,
+    metrics: dict[str, Any] | None,
+) -> str:
+    """Tables of videos and, with ground truth, of errors, at most 80 columns.
+
+    Args:
+      tracks: at least one.
+      category: theirs.
+      config: of the tracker.
+      start: as given to ``track_video``.
+      mask_source: of the object masks.
+      part_masks: "predicted" or "given".
+      metrics: from ``summarize_tracks``.
+    """
+    frames = sum(len(track.frames) for track in tracks)
+    lines = [
+        f"{category.name}: {_count(len(tracks), 'video')}, {_count(frames, 'frame')}",
+        f"start: {start}; keyframes: {_describe_keyframes(config)}",
+        f"object masks: {mask_source}; part masks: {part_masks}",
+        "",
+    ]
+    header = ["video", "frames", "keyframes", "estimates", "lost", "ms per frame"]
+    rows = [
+        [
+            _shorten(track.name),
+            str(len(track.frames)),
+            *(str(int(array.sum())) for array in (track.keyframe, track.estimated, track.lost)),
+            f"{1000 * np.median(track.seconds):.1f}",
+        ]
+        for track in tracks
+    ]
+    lines += text_table(header, rows)
+    if metrics is not None:
+        lines += ["", "errors of all frames but the first of each video, mean / median:", ""]
+        lines += format_tables(metrics)
+    return "\n".join(lines)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _describe_keyframes(config: TrackerConfig) -> str:
+    """The policy with the settings that it heeds."""
+    if config.policy == "fixed":
+        return f"fixed, every {config.interval} frames"
+    if config.policy == "none":
+        return "none"
+    text = f"{config.policy}, energy above {config.threshold:g}"
+    if config.max_unmatched < 1.0:
+        text += f" or {100 * config.max_unmatched:.0f} % unmatched"
+    return text
+
+
+def _shorten(name: str) -> str:
+    return name if len(name) <= _NAME_WIDTH else "…" + name[1 - _NAME_WIDTH :]

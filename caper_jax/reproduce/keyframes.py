@@ -2,28 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
-from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.config import KeyframePolicy, TrackerConfig
 from caper_jax.estimator import Estimator
 from caper_jax.evaluation.tracking import Track, track_errors
-from caper_jax.reproduce import comparison, runs
+from caper_jax.reproduce.data import find_case
 from caper_jax.reproduce.options import Options
-from caper_jax.reproduce.paper import TABLES
-from caper_jax.reproduce.render import Curves, Report, Table, spread
+from caper_jax.reproduce.paper import paper
+from caper_jax.reproduce.report import (
+    ERROR_HEADER,
+    ERROR_LABELS,
+    Report,
+    Table,
+    assumptions,
+    error_rows,
+    missing_rows,
+    paper_json,
+    spread,
+)
+from caper_jax.reproduce.tracking import (
+    TRACKING_NOTES,
+    Condition,
+    describe_tracker,
+    summarize,
+    track_all,
+    tracker_config,
+)
 from caper_jax.tracker import Tracker
+from caper_jax.visualization.plots import Curves
 
 POLICIES: tuple[KeyframePolicy, ...] = ("none", "fixed", "dynamic")
-CATEGORIES = ("robotarm",)
-PER_FRAMES = 100  # slopes are per so many frames
+_CATEGORIES = ("robotarm",)
+_PER_FRAMES = 100  # slopes are per so many frames
 # Frames in a row that no video has: the static estimator never comes to the rescue.
 _NEVER = 10**9
+# Metric -> (its name in files, label of its axis, factor to show it by).
+_CURVES = {
+    "rotation_deg": ("rotation", "rotation error [deg]", 1.0),
+    "translation_relative": ("translation", "translation error [% of the diagonal]", 100.0),
+}
 
 
 def run(name: str, options: Options) -> Report:
@@ -36,54 +60,51 @@ def run(name: str, options: Options) -> Report:
     Raises:
       CaperError: unknown categories, a damaged model, or data that cannot be read or drawn.
     """
-    paper = TABLES[name]
+    table = paper().tables[name]
     rows: list[list[str]] = []
     growth: list[list[str]] = []
     facts, result, shown = [], {}, {}
     curves: dict[str, Curves] = {}
-    for key in options.category or CATEGORIES:
+    for key in options.category or _CATEGORIES:
         figures = {
             policy: of_policy[key]
-            for policy, of_policy in paper.variants.items()
+            for policy, of_policy in table.variants.items()
             if key in of_policy
         }
         if figures:
             shown[key] = figures["dynamic"]
-        found = _measure(key, options, paper.videos, paper.frames)
-        result[key] = {
-            "paper": {policy: comparison.paper_json(figure) for policy, figure in figures.items()},
-            **found,
-        }
-        facts.append(f"{key}: {found['data']}")
-        if not found["policies"]:
-            parts = categories.get(key).parts
+        errors = _measure(key, options, table.videos, table.frames)
+        beside = {policy: paper_json(figure) for policy, figure in figures.items()}
+        result[key] = {"paper": beside, **errors}
+        facts.append(f"{key}: {errors['data']}")
+        if not errors["policies"]:
             for policy, figure in figures.items():
-                rows += comparison.paper_rows(key, parts, figure, f"{policy}: {found['data']}")
+                rows += missing_rows(key, figure, f"{policy}: {errors['data']}")
             continue
-        for policy, summary in found["policies"].items():
-            rows += comparison.rows(key, policy, summary, figures.get(policy))
-            growth += growth_rows(key, policy, summary["growth"])
-        curves |= _curves(key, found["policies"])
-    header = ["category", "part", "keyframes", *comparison.HEADER[3:]]
-    tables = [Table("Errors of tracking, the first pose given", header, rows, comparison.LABELS)]
+        for policy, summary in errors["policies"].items():
+            rows += error_rows(key, policy, summary, figures.get(policy))
+            growth += _growth_rows(key, policy, summary["growth"])
+        curves |= _growth_curves(key, errors["policies"])
+    header = ["category", "part", "keyframes", *ERROR_HEADER]
+    tables = [Table("Errors of tracking, the first pose given", header, rows, ERROR_LABELS)]
     if growth:
         caption = "Growth of the error with the frame: least-squares slope ± its standard error"
-        per = f"per {PER_FRAMES} frames"
+        per = f"per {_PER_FRAMES} frames"
         header = ["category", "keyframes", "part", f"rot [deg {per}]", f"trans [% {per}]"]
         tables.append(Table(caption, header, growth, 3))
     return Report(
-        title=paper.title,
+        title=table.title,
         tables=tables,
         facts=[
-            paper.measured_on(),
+            table.measured_on(),
             *facts,
-            runs.describe_tracker(options),
+            describe_tracker(options),
             "none: every frame is a keyframe with the tracked pose, and a lost track is not "
             "started again; fixed and dynamic: a keyframe's pose comes from the static estimator",
-            *comparison.COLUMNS,
+            *TRACKING_NOTES,
             "a slope is fitted to each video, its standard error is that of their mean: frames of "
             "one video are not independent",
-            *(comparison.assumptions(shown, paper.dataset) if shown else ()),
+            *assumptions(shown, table.dataset),
         ],
         result={"categories": result},
         curves=curves,
@@ -92,22 +113,22 @@ def run(name: str, options: Options) -> Report:
 
 def _measure(name: str, options: Options, videos: int, frames: int) -> dict[str, Any]:
     """All policies of one category, JSON-ready; "data" says why there are none."""
-    case = runs.find_case(name, options, videos, frames)
+    case = find_case(name, options, videos, frames)
     if isinstance(case, str):
         return {"data": case, "policies": {}}
     estimator, source = case
-    found, condition = {}, runs.Condition()
+    summaries, condition = {}, Condition()
     for policy in POLICIES:
         tracker = Tracker(estimator, policy_config(policy, estimator, options))
-        tracks = runs.track_all(tracker, source, condition)
-        summary = runs.summarize(tracks, source, condition)
-        found[policy] = {**summary, "growth": error_growth(tracks, source.category)}
-    return {"data": source.description, "policies": found}
+        tracks = track_all(tracker, source, condition)
+        summary = summarize(tracks, source, condition)
+        summaries[policy] = {**summary, "growth": error_growth(tracks, source.category)}
+    return {"data": source.description, "policies": summaries}
 
 
 def policy_config(policy: KeyframePolicy, estimator: Estimator, options: Options) -> TrackerConfig:
     """The tracker of a policy; without keyframes, nothing rescues a track that drifts away."""
-    config = replace(runs.tracker_config(estimator, options), policy=policy)
+    config = replace(tracker_config(estimator, options), policy=policy)
     return replace(config, patience=_NEVER) if policy == "none" else config
 
 
@@ -125,22 +146,19 @@ def error_growth(tracks: Sequence[Track], category: Category) -> dict[str, Any]:
     """
     errors = [track_errors(track, category) for track in tracks]
     length = min(len(track.frames) for track in tracks)
-    turn = np.stack([error.rotation_deg[1:length] for error in errors])
-    shift = np.stack([error.translation_relative[1:length] for error in errors])
     frames = np.arange(1, length)
-    parts = {}
+    parts: dict[str, dict[str, Any]] = {}
     for part in (0, category.num_parts - 1):
-        parts[category.parts[part]] = {
-            metric: {
-                "mean": values[:, :, part].mean(0).tolist(),
-                **slope(frames, values[..., part]),
-            }
-            for metric, values in (("rotation_deg", turn), ("translation_relative", shift))
-        }
+        metrics = parts[category.parts[part]] = {}
+        for metric in _CURVES:
+            values = np.stack([getattr(error, metric)[1:length, part] for error in errors])
+            metrics[metric] = {"mean": values.mean(0).tolist(), **slope(frames, values)}
     return {"frames": frames.tolist(), "parts": parts}
 
 
-def slope(frames: np.ndarray, errors: np.ndarray) -> dict[str, float | None]:
+def slope(
+    frames: Shaped[np.ndarray, " frames"], errors: Float[np.ndarray, "videos frames"]
+) -> dict[str, float | None]:
     """Least-squares slope of the mean error against the frame, and its standard error.
 
     The slope of the mean is the mean of the videos' slopes; these are independent of each other,
@@ -162,39 +180,29 @@ def slope(frames: np.ndarray, errors: np.ndarray) -> dict[str, float | None]:
     return {"slope": float(slopes.mean()), "standard_error": error}
 
 
-def growth_rows(category: str, policy: str, growth: dict[str, Any]) -> list[list[str]]:
+def _growth_rows(category: str, policy: str, growth: Mapping[str, Any]) -> list[list[str]]:
     """One row per part of ``error_growth``."""
     rows = []
     for part, metrics in growth["parts"].items():
-        cells = []
-        for metric, factor in (("rotation_deg", 1.0), ("translation_relative", 100.0)):
-            scale = factor * PER_FRAMES
+        texts = []
+        for metric, (_, _, factor) in _CURVES.items():
             value, error = metrics[metric]["slope"], metrics[metric]["standard_error"]
-            cells.append(
-                "-"
-                if value is None
-                else spread(scale * value, None if error is None else scale * error, 3)
-            )
-        rows.append([category, policy, part, *cells])
+            texts.append("-" if value is None else spread(value, error, 3, factor * _PER_FRAMES))
+        rows.append([category, policy, part, *texts])
     return rows
 
 
-def _curves(category: str, policies: dict[str, dict[str, Any]]) -> dict[str, Curves]:
-    """Pictures of the error against the frame, one per metric."""
-    pictures = {}
-    for metric, factor, label in (
-        ("rotation_deg", 1.0, "rotation error [deg]"),
-        ("translation_relative", 100.0, "translation error [% of the diagonal]"),
-    ):
+def _growth_curves(category: str, policies: Mapping[str, Any]) -> dict[str, Curves]:
+    """Plots of the error against the frame, one per metric."""
+    plots = {}
+    for metric, (name, label, factor) in _CURVES.items():
         lines = {
             f"{policy}, {part}": (
-                np.array(found["growth"]["frames"]),
+                np.array(summary["growth"]["frames"]),
                 factor * np.array(metrics[metric]["mean"]),
             )
-            for policy, found in policies.items()
-            for part, metrics in found["growth"]["parts"].items()
+            for policy, summary in policies.items()
+            for part, metrics in summary["growth"]["parts"].items()
         }
-        pictures[f"{category}_{metric.partition('_')[0]}"] = Curves(
-            f"{category}: mean over videos", "frame", label, lines
-        )
-    return pictures
+        plots[f"{category}_{name}"] = Curves(f"{category}: mean over videos", "frame", label, lines)
+    return plots

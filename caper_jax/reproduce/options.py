@@ -1,4 +1,4 @@
-"""What a reproduction is asked for; each takes the options it names and leaves the others."""
+"""The choices of a reproduction; each takes the options it names and leaves the others."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from caper_jax.config import GeneratorConfig, override
 from caper_jax.errors import CaperError, unknown_name
 
 SPLIT = "test"
+DEFAULT_MINUTES = 60.0
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,8 @@ class Options:
                 raise unknown_name("category of this table", name, known)
         return [name for name in known if name in self.category or not self.category]
 
-    def drawn(self, config: GeneratorConfig) -> GeneratorConfig:
-        """What generated frames look like: as in ``config``, but for what is asked for here."""
+    def generator(self, config: GeneratorConfig) -> GeneratorConfig:
+        """What generated frames look like: as in ``config``, with the noise of these options."""
         return config if self.noise is None else override(config, f"noise=['{self.noise}']")
 
     def dataset(self) -> tuple[str, Path, str] | None:
@@ -87,3 +88,13 @@ class Options:
         if self.noise is not None:
             raise CaperError("--noise is of generated depth; leave out --data or --noise")
         return self.format, self.data, self.split or SPLIT
+
+    def budget(self) -> str:
+        """Of each run to train, as in the name of its folder: ``3000steps`` or ``60min``.
+
+        Raises:
+          CaperError: a budget in both steps and minutes.
+        """
+        if self.steps is not None and self.minutes is not None:
+            raise CaperError("--steps and --minutes exclude each other")
+        return f"{self.steps}steps" if self.steps else f"{self.minutes or DEFAULT_MINUTES:g}min"

@@ -1,38 +1,38 @@
-"""Table 7 and figure 11: what stage I finds, by what it sees and by how it says a rotation."""
+"""Table 7 and figure 11: the root's pose after stage I, by its input and by its rotation head."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from caper_jax import categories
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.clouds import MIN_POINTS, sample_points
-from caper_jax.data.types import Dataset, Frame
+from caper_jax.data.types import Frame
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator
 from caper_jax.evaluation.protocol import Evaluation, Predictor, evaluate, model_predictor
-from caper_jax.evaluation.report import summarize
-from caper_jax.evaluation.summaries import cell
+from caper_jax.evaluation.report import format_error, summarize
 from caper_jax.lie import so3
-from caper_jax.reproduce import runs, trainings
-from caper_jax.reproduce.frames import open_frames
+from caper_jax.reproduce.ablations import describe_training, frames_of, train_seeds
 from caper_jax.reproduce.options import Options
-from caper_jax.reproduce.paper import PM_DIAGONAL_M, ROOT_INPUT
-from caper_jax.reproduce.render import Report, Scatter, Table, number
+from caper_jax.reproduce.paper import paper
+from caper_jax.reproduce.report import Report, Table, number
+from caper_jax.visualization.plots import Scatter
 
-_FRAMES = 1000
+# Kind -> its settings. The full model of both is trained once, under one label.
 INPUTS = {"root": ("loss.root_input=root",), "whole": ()}
 ROTATIONS = {"direct": ("network.rotation=quaternion",), "decoupled": ()}
+_LABELS = {"whole": "full", "decoupled": "full"}
 ANGLES = ("yaw", "pitch", "roll")
-TABLE7_HEADER = (
+_TABLE7_HEADER = (
     *("category", "input", "seed", "rot paper [deg]", "ours"),
     *("trans paper [%]", "ours [%]"),
 )
-FIGURE11_HEADER = (
+_FIGURE11_HEADER = (
     *("category", "rotation", "seed"),
     *(f"{angle} [deg]" for angle in ANGLES),
     *("first axis [deg]", "second axis [deg]", "whole [deg]"),
@@ -47,55 +47,68 @@ def run(name: str, options: Options) -> Report:
       options: see ``Options``; runs are kept under ``out`` and resumed.
 
     Raises:
-      CaperError: unknown categories, settings or data; see ``trainings.trained``.
+      CaperError: unknown categories, settings or data; see ``ablations.train``.
       KeyboardInterrupt: training was stopped; the same call goes on from there.
     """
-    trainings.check_budget(options)
+    options.budget()  # a contradiction in it is found before anything is drawn
     facts: list[str] = []
     result: dict[str, dict[str, list[dict[str, Any]]]] = {}
     curves: dict[str, Scatter] = {}
     rows: list[list[str]] = []
     kinds = INPUTS if name == "table7" else ROTATIONS
-    for key in options.chosen(ROOT_INPUT):
-        source = open_frames(options, categories.get(key), _FRAMES)
-        if source is None:
-            facts.append(f"{key}: {runs.NO_DATA}")
-            continue
-        dataset, description = source
-        facts.append(f"{key}: {description}")
-        result[key] = {}
+    for key, dataset, _ in frames_of(options, options.chosen(paper().root_input), facts):
+        result[key] = {kind: [] for kind in kinds}
         panels = {}
         for kind, changes in kinds.items():
-            result[key][kind] = []
-            label = {"whole": "full", "decoupled": "full"}.get(kind, kind)
-            for seed in range(options.seeds):
-                estimator = stage_one(trainings.trained(key, label, changes, seed, options))
-                found = measure(estimator, dataset, options.frames, kind == "root")
-                row = {"seed": seed, "steps": estimator.card["steps"]}
+            for seed, full in train_seeds(key, _LABELS.get(kind, kind), changes, options):
+                estimator = stage_one(full)
+                predictor = root_predictor if kind == "root" else model_predictor
+                num_points = estimator.network.num_points
+                estimates = evaluate(
+                    dataset, predictor(estimator), options.frames, num_points=num_points
+                )
+                run_result = {"seed": seed, "steps": full.card["steps"]}
                 if name == "table7":
-                    root = summarize(found, dataset, "model", None)["parts"][0]
-                    row |= {k: root[k] for k in ("rotation_deg", "translation_relative")}
+                    root = summarize(estimates, dataset, "model", None)["parts"][0]
+                    run_result |= {k: root[k] for k in ("rotation_deg", "translation_relative")}
                     rows.append(_table7_row(key, kind, seed, root))
                 else:
-                    errors = _rotation_errors(found, dataset.category.directions)
-                    row |= {f"{of}_deg": _mean_median(values) for of, values in errors.items()}
-                    cells = [cell(row[f"{of}_deg"], 1.0, 2) for of in errors]
-                    rows.append([key, kind, str(seed), *cells])
+                    errors = _rotation_errors(estimates, dataset.category.directions)
+                    means = {of: _mean_median(values) for of, values in errors.items()}
+                    run_result |= {f"{of}_deg": value for of, value in means.items()}
+                    texts = [format_error(value, 1.0, 2) for value in means.values()]
+                    rows.append([key, kind, str(seed), *texts])
                     if seed == 0:
                         panels[kind] = errors["yaw"], errors["pitch"], errors["roll"]
-                result[key][kind].append(row)
+                result[key][kind].append(run_result)
         if panels:
             yaw, pitch, roll = (f"{angle} [deg]" for angle in ANGLES)
             title = f"Errors of the root's rotation, {key}"
             curves[key] = Scatter(title, yaw, pitch, roll, panels)
-    title, caption, header, notes = _TEXTS[name]
+    if name == "table7":
+        diagonal = paper().diagonal_m["partnet"]["laptop"]
+        title = "Table 7, the root's pose from the root alone or from the whole object (Sec 6.4)"
+        table = Table("Errors of the root after stage I, mean / median", _TABLE7_HEADER, rows, 3)
+        notes = [
+            "root: stage I trained and tested on the points of the root part, by true labels",
+            f"the paper's meters are divided by an assumed diagonal of {diagonal:g} m",
+        ]
+    else:
+        title = "Figure 11, errors of the root's rotation: decoupled or regressed directly (Sec 7)"
+        caption = "Errors of the root after stage I, mean / median of their absolute values"
+        table = Table(caption, _FIGURE11_HEADER, rows, 3)
+        notes = [
+            "direct: stage I regresses a quaternion; decoupled: two directions with confidence",
+            "yaw about the root's y, pitch about x, roll about z; first and second axis are the "
+            "directions that the decoupled model regresses",
+        ]
     return Report(
         title=title,
-        tables=[Table(caption, header, rows, 3)],
+        tables=[table],
         facts=[
             "the paper measured on ArtImage, ours were measured on:",
             *facts,
-            f"{options.seeds} runs of each kind, {trainings.describe(options)}",
+            describe_training(options),
             *notes,
         ],
         result={"categories": result},
@@ -107,16 +120,6 @@ def stage_one(estimator: Estimator) -> Estimator:
     """The same model without stage II's correction: its root pose is stage I's."""
     network = replace(estimator.network, refine_steps=0)
     return Estimator(estimator.category, network, estimator.variables, estimator.card)
-
-
-def measure(
-    estimator: Estimator, dataset: Dataset, limit: int | None, root_alone: bool
-) -> Evaluation:
-    """Estimates from the whole object, or from the points that the data label as the root's."""
-    predictor = model_predictor(estimator)
-    if root_alone:
-        predictor = root_predictor(estimator)
-    return evaluate(dataset, predictor, limit, num_points=estimator.network.num_points)
 
 
 def root_predictor(estimator: Estimator) -> Predictor:
@@ -139,74 +142,56 @@ def root_predictor(estimator: Estimator) -> Predictor:
     return predict
 
 
-def error_angles(estimate: ArticulatedPose, truth: ArticulatedPose) -> np.ndarray:
+def error_angles(
+    estimate: ArticulatedPose, truth: ArticulatedPose
+) -> Float[np.ndarray, "frames 3"]:
     """[F, 3] degrees: yaw about the root's y, then pitch about x, then roll about z.
 
     They take the estimated root to the true one: R_estimate Ry(yaw) Rx(pitch) Rz(roll) = R_truth.
     """
-    off = _off(estimate, truth)
-    yaw = np.arctan2(off[:, 0, 2], off[:, 2, 2])
-    pitch = np.arcsin(np.clip(-off[:, 1, 2], -1, 1))
-    roll = np.arctan2(off[:, 1, 0], off[:, 1, 1])
+    error = _root_rotation_error(estimate, truth)
+    yaw = np.arctan2(error[:, 0, 2], error[:, 2, 2])
+    pitch = np.arcsin(np.clip(-error[:, 1, 2], -1, 1))
+    roll = np.arctan2(error[:, 1, 0], error[:, 1, 1])
     return np.degrees(np.stack([yaw, pitch, roll], -1))
 
 
-def axis_errors(found: Evaluation, directions: tuple[str, str]) -> np.ndarray:
+def axis_errors(
+    estimates: Evaluation, directions: tuple[str, str]
+) -> Float[np.ndarray, "frames 2"]:
     """[F, 2] degrees between the estimated and the true directions that stage I regresses."""
-    off = _off(found.estimate, found.truth)
-    cosines = [off[:, i, i] for i in ("xyz".index(axis) for axis in directions)]
+    error = _root_rotation_error(estimates.estimate, estimates.truth)
+    cosines = [error[:, i, i] for i in ("xyz".index(axis) for axis in directions)]
     return np.degrees(np.arccos(np.clip(np.stack(cosines, -1), -1, 1)))
 
 
-def _off(estimate: ArticulatedPose, truth: ArticulatedPose) -> np.ndarray:
+def _root_rotation_error(estimate: ArticulatedPose, truth: ArticulatedPose) -> np.ndarray:
+    """[F, 3, 3] from the estimated root's axes to the true one's."""
     one, other = (np.asarray(pose.rotation[:, 0], np.float64) for pose in (estimate, truth))
     return one.swapaxes(-1, -2) @ other
 
 
-def _table7_row(category: str, kind: str, seed: int, root: dict[str, Any]) -> list[str]:
-    turn, shift = ROOT_INPUT[category][kind]
+def _table7_row(category: str, kind: str, seed: int, root: Mapping[str, Any]) -> list[str]:
+    figures = paper().root_input[category][kind]
+    relative = figures.translation_m / paper().diagonal_m["partnet"][category]
     return [
-        *(category, kind, str(seed), number(turn, 1), cell(root["rotation_deg"], 1.0, 2)),
-        number(100 * shift / PM_DIAGONAL_M, 2),
-        cell(root["translation_relative"], 100.0, 2),
+        *(category, kind, str(seed)),
+        *(number(figures.rotation_deg, 1), format_error(root["rotation_deg"], 1.0, 2)),
+        *(number(relative, 2, 100.0), format_error(root["translation_relative"], 100.0, 2)),
     ]
 
 
-def _rotation_errors(found: Evaluation, directions: tuple[str, str]) -> dict[str, np.ndarray]:
+def _rotation_errors(estimates: Evaluation, directions: tuple[str, str]) -> dict[str, np.ndarray]:
     """Degrees [F] by what is off, in the columns of figure 11; of the frames that did not fail."""
-    good = ~found.failed
-    angles = error_angles(found.estimate, found.truth)[good]
-    axes = axis_errors(found, directions)[good]
-    whole = so3.geodesic_distance(found.estimate.rotation[:, 0], found.truth.rotation[:, 0])
-    return {
-        **dict(zip((*ANGLES, "first_axis", "second_axis"), (*angles.T, *axes.T), strict=True)),
-        "rotation": np.degrees(np.asarray(whole))[good],
-    }
+    good = ~estimates.failed
+    angles = error_angles(estimates.estimate, estimates.truth)[good]
+    axes = axis_errors(estimates, directions)[good]
+    roots = (pose.rotation[:, 0] for pose in (estimates.estimate, estimates.truth))
+    whole = np.degrees(np.asarray(so3.geodesic_distance(*roots)))[good]
+    columns = (*ANGLES, "first_axis", "second_axis", "rotation")
+    return dict(zip(columns, (*angles.T, *axes.T, whole), strict=True))
 
 
 def _mean_median(errors: np.ndarray) -> dict[str, float | None]:
-    """Of the amounts, as ``cell`` takes them."""
+    """Of the absolute values, as ``format_error`` takes them."""
     return {"mean": float(np.abs(errors).mean()), "median": float(np.median(np.abs(errors)))}
-
-
-_TEXTS = {
-    "table7": (
-        "Table 7, the root's pose from the root alone or from the whole object (Sec 6.4)",
-        "Errors of the root after stage I, mean / median",
-        TABLE7_HEADER,
-        (
-            "root: stage I trained and tested on the points of the root part, by true labels",
-            f"the paper's meters are divided by an assumed diagonal of {PM_DIAGONAL_M:g} m",
-        ),
-    ),
-    "figure11": (
-        "Figure 11, errors of the root's rotation: decoupled or regressed directly (Sec 7)",
-        "Errors of the root after stage I, mean / median of their amounts",
-        FIGURE11_HEADER,
-        (
-            "direct: stage I regresses a quaternion; decoupled: two directions with confidence",
-            "yaw about the root's y, pitch about x, roll about z; first and second axis are the "
-            "directions that the decoupled model regresses",
-        ),
-    ),
-}

@@ -16,7 +16,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.synthetic.frames import draw_state_and_poses
 from caper_jax.synthetic.instances import build_bank, draw_instances
 from caper_jax.synthetic.ray_casting import cast, projected_bounds
-from caper_jax.visualization.figures import save_figure
+from caper_jax.visualization.plots import save_figure
 from caper_jax.visualization.scene import part_color
 
 TILE = 180  # pixels per side
@@ -44,14 +44,12 @@ def write_gallery(
     Raises:
       CaperError: a category without procedural shapes.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     rows = [render_instances(category, count, split, seed) for category in categories]
     label = 24  # pixels for a row's name
     width, height = count * TILE, len(rows) * (TILE + label)
     figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
-    FigureCanvasAgg(figure)
     for number, (category, images) in enumerate(zip(categories, rows, strict=True)):
         top = 1 - (number * (TILE + label) + label) / height
         axes = figure.add_axes((0, top - TILE / height, 1, TILE / height))

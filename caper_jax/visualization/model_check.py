@@ -6,13 +6,12 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from caper_jax.data.urdf.canonical import ImportedObject
 from caper_jax.synthetic.urdf_frames import PartCaster
-from caper_jax.visualization.figures import save_figure
+from caper_jax.visualization.plots import save_figure
 from caper_jax.visualization.scene import part_color
 
 PIXELS = 360
@@ -44,7 +43,6 @@ def write_model_check(path: str | Path, item: ImportedObject) -> Path:
       CaperError: the packages for meshes are not installed, or the file cannot be written.
     """
     figure = Figure(figsize=(16.6, 5.4), dpi=DPI)
-    FigureCanvasAgg(figure)
     axes = figure.subplots(1, 4)
     caster = PartCaster(item.reference.parts)
     rest = np.zeros(item.reference.num_joints)

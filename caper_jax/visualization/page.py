@@ -19,6 +19,8 @@ from PIL import Image
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.errors import CaperError
+from caper_jax.evaluation.records import joint_lines
+from caper_jax.files import write_atomically
 from caper_jax.visualization.scene import (
     BOX_EDGES,
     BOX_FACES,
@@ -26,7 +28,6 @@ from caper_jax.visualization.scene import (
     box_corners,
     crop_box,
     depth_range,
-    joint_lines,
     joint_name,
     joint_segments,
     part_color,
@@ -74,9 +75,9 @@ def write_page(path: str | Path, scenes: Sequence[Scene], title: str = "caper_ja
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(page, "utf-8")
     except OSError as error:
         raise CaperError(f"cannot write {path}: {error.strerror or error}") from error
+    write_atomically(path, page.encode())
     return path
 
 

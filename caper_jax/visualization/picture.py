@@ -10,14 +10,13 @@ import matplotlib
 import matplotlib.patheffects as effects
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.errors import CaperError
-from caper_jax.visualization.figures import save_figure
+from caper_jax.visualization.plots import save_figure
 from caper_jax.visualization.scene import (
     BOX_EDGES,
     NEAREST,
@@ -62,7 +61,6 @@ def write_picture(path: str | Path, scenes: Sequence[Scene]) -> Path:
     if not scenes:
         raise CaperError("a picture needs at least one scene")
     figure = Figure(figsize=(sum(WIDTHS) + 0.9, ROW_HEIGHT * len(scenes) + 0.35), dpi=DPI)
-    FigureCanvasAgg(figure)
     top = 1 - 0.45 / figure.get_figheight()
     bottom = 0.35 / figure.get_figheight()
     grid = figure.add_gridspec(
@@ -134,7 +132,7 @@ def draw_estimate(axes: Axes, scene: Scene) -> None:
 
 
 def _draw_side(axes: Axes, scene: Scene) -> None:
-    """An orthographic view, turned about the object's up axis."""
+    """An orthographic view from another azimuth about the object's up axis."""
     _frame(axes)
     axes.set_facecolor(PAPER)
     right, down, forward = _side_view(scene)
@@ -146,9 +144,10 @@ def _draw_side(axes: Axes, scene: Scene) -> None:
 
     far_first = np.argsort(-(scene.points @ forward))
     _draw_objects(axes, scene, flat, eye=middle - 1e3 * forward, far_first=far_first)
-    shown = [flat(scene.points), flat(box_corners(scene.pose)).reshape(-1, 2)]
+    drawn = (box_corners(scene.pose), joint_segments(scene.pose, scene.category))
+    shown = [flat(scene.points), *(flat(points).reshape(-1, 2) for points in drawn)]
     extent = np.concatenate(shown)
-    center, half = (extent.min(0) + extent.max(0)) / 2, 0.64 * np.ptp(extent, axis=0).max()
+    center, half = (extent.min(0) + extent.max(0)) / 2, 0.57 * np.ptp(extent, axis=0).max()
     _limit(axes, center - half, center + half)
     _draw_scale(axes)
 
@@ -263,8 +262,8 @@ def _side_view(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     elevation = np.radians(25)
 
     def forward(azimuth: float) -> np.ndarray:
-        turned = np.cos(azimuth) * level + np.sin(azimuth) * np.cross(up, level)
-        return np.cos(elevation) * turned - np.sin(elevation) * up
+        horizontal = np.cos(azimuth) * level + np.sin(azimuth) * np.cross(up, level)
+        return np.cos(elevation) * horizontal - np.sin(elevation) * up
 
     # A box shows each pair of faces by their area times the cosine of the viewing angle.
     edges = corners[:, [4, 2, 1]] - corners[:, :1]

@@ -5,18 +5,22 @@ Everything is in the camera's frame (OpenCV: x right, y down, z forward), meters
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.types import pose_shapes
 from caper_jax.errors import CaperError
+from caper_jax.evaluation.records import joint_lines
 from caper_jax.geometry import boxes
 
-# Okabe and Ito's colors, which color-blind people can tell apart; yellow, hard to see on white,
+# Okabe and Ito's colors, which color-blind readers can tell apart; yellow, hard to see on white,
 # comes last.
 PART_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442")
 
@@ -64,29 +68,27 @@ class Scene:
     intrinsics: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        problems = []
-        points = np.asarray(self.points, float)
-        labels = np.asarray(self.labels)
-        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-            problems.append(f"points must be finite numbers [N, 3], got shape {points.shape}")
-        if labels.shape != points.shape[:1]:
-            problems.append(f"labels has shape {labels.shape}, points {points.shape}")
-        elif labels.size and not 0 <= labels.min() <= labels.max() < self.category.num_parts:
-            problems.append(f"labels must be 0 to {self.category.num_parts - 1}")
-        for which, pose in (("pose", self.pose), ("truth", self.truth)):
-            for key, shape in pose_shapes(self.category.num_parts).items() if pose else ():
-                array = np.asarray(getattr(pose, key))
-                if array.shape != shape or not np.isfinite(array).all():
-                    problems.append(f"{which}.{key} must be finite {shape}, got {array.shape}")
+        for name, array, shape in self._shapes():
+            if np.shape(array) != shape or not np.isfinite(array).all():
+                raise CaperError(
+                    f"scene {self.name!r}: {name} must be finite numbers {shape}, got {np.shape(array)}"
+                )
+        if not np.isin(self.labels, np.arange(self.category.num_parts)).all():
+            last = self.category.num_parts - 1
+            raise CaperError(f"scene {self.name!r}: labels must be parts 0 to {last}")
+
+    def _shapes(self) -> Iterator[tuple[str, Any, tuple[int, ...]]]:
+        """Name, array and expected shape of everything that is given."""
+        count = len(self.points)
+        yield "points", self.points, (count, 3)
+        yield "labels", self.labels, (count,)
+        for name, pose in self.poses:
+            for key, shape in pose_shapes(self.category.num_parts).items():
+                yield f"{name} {key}", getattr(pose, key), shape
         if self.depth is not None:
-            if self.depth.ndim != 2:
-                problems.append(f"depth must be [H, W], got {self.depth.shape}")
-            if self.intrinsics is None or self.intrinsics.shape != (3, 3):
-                problems.append("depth needs intrinsics [3, 3]")
-            if self.mask is not None and self.mask.shape != self.depth.shape:
-                problems.append(f"mask is {self.mask.shape}, depth {self.depth.shape}")
-        if problems:
-            raise CaperError(f"scene {self.name!r}: {'; '.join(problems)}")
+            yield "intrinsics", self.intrinsics if self.intrinsics is not None else (), (3, 3)
+            if self.mask is not None:
+                yield "mask", self.mask, np.shape(self.depth)
 
     @property
     def poses(self) -> tuple[tuple[str, ArticulatedPose], ...]:
@@ -100,30 +102,14 @@ def part_color(part: int) -> str:
     return PART_COLORS[part % len(PART_COLORS)]
 
 
-def box_corners(pose: ArticulatedPose) -> np.ndarray:
+def box_corners(pose: ArticulatedPose) -> Float[np.ndarray, "parts 8 3"]:
     """[K, 8, 3] corners of all parts' boxes in the camera's frame, in ``CORNER_SIGNS`` order."""
     arrays = (pose.rotation, pose.translation, pose.box_center, pose.size)
     with jax.enable_x64(True):
         return np.asarray(boxes.corners(*(np.asarray(array, np.float64) for array in arrays)))
 
 
-def joint_lines(pose: ArticulatedPose, category: Category) -> tuple[np.ndarray, np.ndarray]:
-    """The joints' axes in the camera's frame.
-
-    Axes and pivots are given in the root's rest frame; at rest all parts share that frame, so the
-    pose of the part that a joint is mounted on carries them to the camera, however deep the tree.
-
-    Returns:
-      ([J, 3] unit directions, [J, 3] points on the axes, meters).
-    """
-    parents = list(category.parents)
-    rotation = np.asarray(pose.rotation, float)[parents]
-    axis = np.einsum("jab,jb->ja", rotation, np.asarray(pose.joint_axis, float))
-    pivot = np.einsum("jab,jb->ja", rotation, np.asarray(pose.joint_pivot, float))
-    return axis, pivot + np.asarray(pose.translation, float)[parents]
-
-
-def joint_segments(pose: ArticulatedPose, category: Category) -> np.ndarray:
+def joint_segments(pose: ArticulatedPose, category: Category) -> Float[np.ndarray, "joints 2 3"]:
     """The piece of every joint's axis to draw, a little longer than the part that it carries.
 
     A revolute joint's piece lies on its axis, beside the part. A prismatic joint has a direction
@@ -144,7 +130,9 @@ def joint_segments(pose: ArticulatedPose, category: Category) -> np.ndarray:
     return np.stack([middle - offset, middle + offset], axis=1)
 
 
-def hidden_edges(corners: np.ndarray, eye: np.ndarray) -> np.ndarray:
+def hidden_edges(
+    corners: Float[np.ndarray, "8 3"], eye: Float[np.ndarray, 3]
+) -> Bool[np.ndarray, 12]:
     """Which edges of one box its own faces hide.
 
     Args:
@@ -164,13 +152,15 @@ def hidden_edges(corners: np.ndarray, eye: np.ndarray) -> np.ndarray:
     return np.array([all(faces) for faces in beside])
 
 
-def project(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+def project(
+    points: Float[np.ndarray, "*batch 3"], intrinsics: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "*batch 2"]:
     """Pixels [..., 2] of camera points [..., 3] in front of the camera; pixel centers are whole."""
     image = np.asarray(points, float) @ np.asarray(intrinsics, float).T
     return image[..., :2] / image[..., 2:]
 
 
-def crop_box(scene: Scene, margin: float = 0.12) -> tuple[np.ndarray, np.ndarray]:
+def crop_box(scene: Scene, margin: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
     """The square of the image that shows the object and the estimate, but no wildly wrong one.
 
     Args:
@@ -184,11 +174,12 @@ def crop_box(scene: Scene, margin: float = 0.12) -> tuple[np.ndarray, np.ndarray
     pixels = project(scene.points, intrinsics)
     low, high = pixels.min(0), pixels.max(0)
     most = (high - low).max()
-    corners = box_corners(scene.pose).reshape(-1, 3)
-    corners = project(corners[corners[:, 2] > NEAREST], intrinsics)
-    if len(corners):
-        low = np.maximum(np.minimum(low, corners.min(0)), low - most)
-        high = np.minimum(np.maximum(high, corners.max(0)), high + most)
+    segments = joint_segments(scene.pose, scene.category)
+    drawn = np.concatenate([box_corners(scene.pose).reshape(-1, 3), segments.reshape(-1, 3)])
+    drawn = project(drawn[drawn[:, 2] > NEAREST], intrinsics)
+    if len(drawn):
+        low = np.maximum(np.minimum(low, drawn.min(0)), low - most)
+        high = np.minimum(np.maximum(high, drawn.max(0)), high + most)
     half = max(float((high - low).max()) * (0.5 + margin), 1e-6)
     return (low + high) / 2 - half, (low + high) / 2 + half
 
@@ -201,7 +192,7 @@ def depth_range(scene: Scene) -> tuple[float, float]:
 
 
 def format_state(state: float, joint_type: str) -> str:
-    """A joint state for people: ``87.3°`` or ``12.4 cm``."""
+    """A joint state as text: ``87.3°`` or ``12.4 cm``."""
     return f"{np.degrees(state):.1f}°" if joint_type == "revolute" else f"{100 * state:.1f} cm"
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.evaluation.metrics import PoseErrors, pose_errors, pose_errors_up_to_symmetry
-from caper_jax.evaluation.summaries import align
+from caper_jax.evaluation.report import text_table
 from caper_jax.lie import so3
 from caper_jax.visualization.scene import Scene, format_state, joint_name
 
@@ -37,25 +37,23 @@ def format_scene(scene: Scene) -> str:
     pose, category, errors = scene.pose, scene.category, scene_errors(scene)
     with jax.enable_x64(True):
         vectors = np.degrees(np.asarray(so3.log(np.asarray(pose.rotation, np.float64))))
-    rows = [["part", "position [m]", "rotation vector [deg]", "size [cm]"]]
+    rows = []
     for part, name in enumerate(category.parts):
         size = 100 * np.asarray(pose.size)[part]
         position = np.asarray(pose.translation)[part]
         rows.append([name, _triple(position, 3), _triple(vectors[part], 1), _triple(size, 1)])
-        for label, error in errors.items():
-            shift, turn, overlap = part_errors(error, part)
-            rows.append([f"  {label}", shift, turn, overlap])
-    lines = align(rows)
-    rows = [["joint", "axis", "pivot [m]", "state"]]
+        rows += [[f"  {label}", *part_errors(error, part)] for label, error in errors.items()]
+    lines = text_table(["part", "position [m]", "rotation vector [deg]", "size [cm]"], rows)
+    rows = []
     for index, joint in enumerate(category.joints):
-        turning = joint.type == "revolute"
-        pivot = _triple(np.asarray(pose.joint_pivot)[index], 3) if turning else "-"
+        pivot = _triple(np.asarray(pose.joint_pivot)[index], 3) if joint.type == "revolute" else "-"
         state = format_state(float(pose.joint_state[index]), joint.type)
         axis = _triple(np.asarray(pose.joint_axis)[index], 3)
         rows.append([joint_name(category, index), axis, pivot, state])
         for label, error in errors.items():
             rows.append([f"  {label}", *joint_errors(error, index, joint.type)])
-    return "\n".join([*lines, "", *align(rows)])
+    lines += ["", *text_table(["joint", "axis (rest)", "pivot (rest) [m]", "state"], rows)]
+    return "\n".join([*lines, "", "parts: camera frame; joints: rest frame of the root"])
 
 
 def part_errors(errors: PoseErrors, part: int) -> tuple[str, str, str]:

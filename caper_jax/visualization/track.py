@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -17,8 +16,8 @@ from matplotlib.ticker import MaxNLocator
 from caper_jax.articulation.category import Category
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.tracking import Track
-from caper_jax.visualization.figures import save_figure
 from caper_jax.visualization.picture import DPI, INK, PAPER, TRUTH, draw_estimate
+from caper_jax.visualization.plots import save_figure
 from caper_jax.visualization.scene import Scene, format_state, joint_name, part_color
 
 MAX_TILES = 12
@@ -71,7 +70,6 @@ def write_sheet(path: str | Path, title: str, tiles: Sequence[Tile]) -> Path:
     rows = -(-len(tiles) // columns)
     width, height = max(columns, 2) * _TILE, rows * (_TILE + 0.45) + 0.7
     figure = Figure(figsize=(width, height), dpi=DPI)
-    FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     figure.subplots_adjust(
         left=0.01,
@@ -146,7 +144,6 @@ def write_states(
     kinds = [kind for kind in ("revolute", "prismatic") if kind in category.joint_types]
     ratios = [2.4] * len(kinds) + [1.3]
     figure = Figure(figsize=(9.0, 1.6 * sum(ratios) / 1.3 + 0.6), dpi=DPI)
-    FigureCanvasAgg(figure)
     axes = figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
     for axis, kind in zip(axes, kinds, strict=False):
         _draw_states(axis, track, category, kind)

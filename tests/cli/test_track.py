@@ -26,8 +26,8 @@ from caper_jax.data import hdf5
 from caper_jax.data.live import pack_frame, read_frames
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator
-from caper_jax.evaluation.track_report import format_tracks, frame_record
-from caper_jax.evaluation.tracking import Track
+from caper_jax.evaluation.records import frame_record
+from caper_jax.evaluation.tracking import Track, format_tracks
 from caper_jax.tracker import Tracker
 from caper_jax.tracking.step import TrackResult
 from caper_jax.visualization.track import evenly_spaced, write_states
@@ -314,10 +314,10 @@ class TestReport:
         assert list(record["parts"]) == ["base", "link", "slider"]
         link, slider = record["joints"]["link"], record["joints"]["slider"]
         assert (link["type"], link["unit"]) == ("revolute", "degrees")
-        assert link["state"] == pytest.approx(40.107046) and link["pivot"] == [0.02, 0.05, -0.03]
+        assert link["state"] == pytest.approx(40.107046) and link["pivot_rest"] == [0.02, 0.05, -0.03]
         assert (slider["type"], slider["unit"]) == ("prismatic", "meters")
-        assert slider["state"] == pytest.approx(0.08) and slider["pivot"] is None
-        assert slider["axis"] == [1.0, 0.0, 0.0]
+        assert slider["state"] == pytest.approx(0.08) and slider["pivot_rest"] is None
+        assert slider["axis_rest"] == [1.0, 0.0, 0.0]
         turned = np.array(record["parts"]["link"]["rotation"])
         base = np.array(record["parts"]["base"]["rotation"])
         angle = Rotation.from_matrix(base.T @ turned).magnitude()

@@ -19,7 +19,7 @@ from caper_jax.config import LoaderConfig, to_dict, update
 from caper_jax.errors import CaperError
 from caper_jax.models.files import read_model, write_card, write_model
 from caper_jax.training import train as run
-from caper_jax.visualization.curves import training_curves
+from caper_jax.visualization.plots import training_curves
 
 ROOT = Path(__file__).resolve().parents[2]
 # A batch that no eight devices can share: compiling for one is faster.

@@ -22,7 +22,7 @@ from caper_jax.evaluation import protocol
 from caper_jax.reproduce import ablations, root_pose, trainings
 from caper_jax.reproduce.render import Scatter
 from caper_jax.training import train as training
-from caper_jax.visualization.curves import write_scatter
+from caper_jax.visualization.plots import write_scatter
 
 LAPTOP = categories.get("laptop")
 

@@ -48,7 +48,7 @@ from caper_jax.reproduce.options import Options
 from caper_jax.reproduce.paper import OCCLUSION, TABLES
 from caper_jax.reproduce.render import Curves, Table, markdown
 from caper_jax.tracker import Tracker
-from caper_jax.visualization.curves import write_curves
+from caper_jax.visualization.plots import write_curves
 
 LAPTOP = categories.get("laptop")
 SMALL = GeneratorConfig(instances=3, grid=24, num_points=64, noise=("none",))

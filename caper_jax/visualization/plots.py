@@ -1,0 +1,122 @@
+"""Plots of what was measured: lines, and points in panels; and the one way to write a figure."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from caper_jax.errors import CaperError
+from caper_jax.files import write_atomically
+
+_SIZE, _DPI = (8.0, 4.5), 120
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Lines of one plot: label -> (x [N], y [N])."""
+
+    title: str
+    x_label: str
+    y_label: str
+    lines: dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Points of one plot, a panel per label: label -> (x [N], y [N], color [N]), equal axes."""
+
+    title: str
+    x_label: str
+    y_label: str
+    color_label: str
+    panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+
+def write_plot(path: str | Path, plot: Curves | Scatter) -> Path:
+    """Writes a PNG of lines with axes, title and legend, or of points in panels.
+
+    Points beyond the axes, which hold 98 % of all, are drawn at their edge.
+
+    Args:
+      path: the file; its folder is made if it does not exist.
+      plot: what to draw.
+
+    Raises:
+      CaperError: the file cannot be written.
+    """
+    figure = Figure(figsize=_SIZE, dpi=_DPI, facecolor="white", layout="constrained")
+    if isinstance(plot, Curves):
+        _draw_curves(figure, plot)
+    else:
+        _draw_scatter(figure, plot)
+    return save_figure(figure, path)
+
+
+def _draw_curves(figure: Figure, curves: Curves) -> None:
+    axes = figure.add_subplot()
+    for label, (x, y) in curves.lines.items():
+        axes.plot(x, y, label=label, linewidth=1.2)
+    axes.set(title=curves.title, xlabel=curves.x_label, ylabel=curves.y_label)
+    axes.set_ylim(bottom=0.0)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+
+
+def _draw_scatter(figure: Figure, scatter: Scatter) -> None:
+    panels = figure.subplots(1, len(scatter.panels), sharex=True, sharey=True, squeeze=False)[0]
+    values = np.abs(np.concatenate([np.concatenate(p) for p in scatter.panels.values()]))
+    reach = max(float(np.quantile(values, 0.98)), 1e-3)
+    for axes, (label, coordinates) in zip(panels, scatter.panels.items(), strict=True):
+        x, y, color = (np.clip(v, -reach, reach) for v in coordinates)
+        drawn = axes.scatter(x, y, c=color, s=5, cmap="coolwarm", vmin=-reach, vmax=reach)
+        axes.set(title=label, xlabel=scatter.x_label, ylabel=scatter.y_label)
+        axes.set(xlim=(-1.05 * reach, 1.05 * reach), ylim=(-1.05 * reach, 1.05 * reach))
+        axes.set_aspect("equal")
+        axes.grid(alpha=0.3)
+    figure.colorbar(drawn, ax=panels, label=scatter.color_label, shrink=0.8)
+    figure.suptitle(scatter.title)
+
+
+def training_curves(title: str, rows: Sequence[dict[str, Any]]) -> Curves:
+    """Loss, and errors in degrees, of a run against its steps.
+
+    Args:
+      title: of the plot.
+      rows: lines of metrics.jsonl, at least one.
+    """
+    lines = {}
+    for name in ("loss", *(key for key in rows[-1] if key.endswith("_deg"))):
+        known = [(row["step"], row[name]) for row in rows if row.get(name) is not None]
+        if known:
+            step, value = np.array(known, float).T
+            label = f"{name[:-4].replace('_', ' ')} [deg]" if name.endswith("_deg") else name
+            lines[label] = (step, value)
+    return Curves(title, "step", "mean over the batches between two lines", lines)
+
+
+def save_figure(figure: Figure, path: str | Path, **options: Any) -> Path:
+    """Writes a figure as PNG or whatever the path's ending names; makes the folder.
+
+    Args:
+      options: as ``Figure.savefig`` takes them.
+
+    Raises:
+      CaperError: the file cannot be written, or no such format is known.
+    """
+    path = Path(path)
+    buffer = io.BytesIO()
+    try:
+        figure.savefig(buffer, format=path.suffix[1:] or "png", **options)
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except ValueError as error:
+        raise CaperError(f"cannot write {path}: {error}") from error
+    except OSError as error:
+        raise CaperError(f"cannot write {path}: {error.strerror or error}") from error
+    write_atomically(path, buffer.getvalue())
+    return path
