@@ -82,9 +82,7 @@ REPRODUCTIONS = {
     "table10": Reproduction(
         "keyframes", "keyframes none, fixed or dynamic; error against frame", _TRACKING
     ),
-    "reliability": Reproduction(
-        "static", "how often the truth lies where the model says", _STATIC
-    ),
+    "reliability": Reproduction("static", "how often the truth lies where the model says", _STATIC),
     "jitter": Reproduction("motion", "jitter on an object that stands still", _MOVING),
     "modes": Reproduction("motion", "errors by how camera and joints move", _MOVING),
 }

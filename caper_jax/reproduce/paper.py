@@ -3,11 +3,11 @@
 Parts are in the paper's order, root first, which is ours where the numbers of parts agree.
 
 The paper gives translation errors in meters but not the size of its objects; ours are relative to
-the diagonal of the object's box at rest. To compare, the paper's meters are divided by "diagonal_m",
-assumed for three kinds of objects. "partnet" (ArtImage, PM-Videos): PartNet's units are read as
-meters, about 2 across. "reart" (ReArtMix, ReArt-Videos): mean over the 43 scanned objects of
-ReArt-48 of the diagonals of their boxes, as the public urdf_metas.json of ReArtMix has them.
-"robotarm": a Franka arm, about 1.1 m from the base plate to the top at zero angles.
+the diagonal of the object's box at rest. To compare, the paper's meters are divided by
+"diagonal_m", assumed for three kinds of objects. "partnet" (ArtImage, PM-Videos): PartNet's units
+are taken as meters, about 2 across. "reart" (ReArtMix, ReArt-Videos): mean over the 43 scanned
+objects of ReArt-48 of the diagonals of their boxes, as the public urdf_metas.json of ReArtMix has
+them. "robotarm": a Franka arm, about 1.1 m from the base plate to the top at zero angles.
 """
 
 from __future__ import annotations

@@ -70,9 +70,8 @@ class Scene:
     def __post_init__(self) -> None:
         for name, array, shape in self._shapes():
             if np.shape(array) != shape or not np.isfinite(array).all():
-                raise CaperError(
-                    f"scene {self.name!r}: {name} must be finite numbers {shape}, got {np.shape(array)}"
-                )
+                problem = f"must be finite numbers {shape}, got shape {np.shape(array)}"
+                raise CaperError(f"scene {self.name!r}: {name} {problem}")
         if not np.isin(self.labels, np.arange(self.category.num_parts)).all():
             last = self.category.num_parts - 1
             raise CaperError(f"scene {self.name!r}: labels must be parts 0 to {last}")
