@@ -1,4 +1,4 @@
-"""Jitter on objects that stand still, and errors by how camera and joints move: generated videos."""
+"""Jitter on objects that stand still, and errors by how camera and joints move."""
 
 from __future__ import annotations
 

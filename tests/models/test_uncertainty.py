@@ -21,7 +21,7 @@ from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load
 from caper_jax.models import uncertainty
 from caper_jax.models.files import write_model
-from caper_jax.reproduce import reliability
+from caper_jax.reproduce.static import ball_share, interval_share
 from caper_jax.training import fit_uncertainty
 
 BOX = categories.get("box")
@@ -44,8 +44,8 @@ def test_radii_of_a_normal_distribution():
     assert pytest.approx(chi(3).ppf(uncertainty.COVERAGE), abs=1e-6) == uncertainty.RADIUS_3D
     assert pytest.approx(chi(1).ppf(uncertainty.COVERAGE), abs=1e-6) == uncertainty.RADIUS_1D
     for radius in (0.1, 1.0, 2.5):
-        assert reliability.ball_share(radius) == pytest.approx(chi(3).cdf(radius))
-        assert reliability.interval_share(radius) == pytest.approx(chi(1).cdf(radius))
+        assert ball_share(radius) == pytest.approx(chi(3).cdf(radius))
+        assert interval_share(radius) == pytest.approx(chi(1).cdf(radius))
 
 
 def test_evidence_counts_doubts_and_asks_about_parts():
