@@ -19,7 +19,6 @@ from PIL import Image
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.errors import CaperError
-from caper_jax.evaluation.records import joint_lines
 from caper_jax.files import write_atomically
 from caper_jax.visualization.scene import (
     BOX_EDGES,
@@ -28,6 +27,7 @@ from caper_jax.visualization.scene import (
     box_corners,
     crop_box,
     depth_range,
+    joint_lines,
     joint_name,
     joint_segments,
     part_color,

@@ -17,7 +17,6 @@ from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.types import pose_shapes
 from caper_jax.errors import CaperError
-from caper_jax.evaluation.records import joint_lines
 from caper_jax.geometry import boxes
 
 # Okabe and Ito's colors, which color-blind readers can tell apart; yellow, hard to see on white,
@@ -106,6 +105,24 @@ def box_corners(pose: ArticulatedPose) -> Float[np.ndarray, "parts 8 3"]:
     arrays = (pose.rotation, pose.translation, pose.box_center, pose.size)
     with jax.enable_x64(True):
         return np.asarray(boxes.corners(*(np.asarray(array, np.float64) for array in arrays)))
+
+
+def joint_lines(
+    pose: ArticulatedPose, category: Category
+) -> tuple[Float[np.ndarray, "joints 3"], Float[np.ndarray, "joints 3"]]:
+    """The joints' axes in the camera's frame.
+
+    Axes and pivots are given in the root's rest frame; at rest all parts share that frame, so the
+    pose of the part that a joint is mounted on carries them to the camera, however deep the tree.
+
+    Returns:
+      ([J, 3] unit directions, [J, 3] points on the axes, meters).
+    """
+    parents = list(category.parents)
+    rotation = np.asarray(pose.rotation, float)[parents]
+    axis = np.einsum("jab,jb->ja", rotation, np.asarray(pose.joint_axis, float))
+    pivot = np.einsum("jab,jb->ja", rotation, np.asarray(pose.joint_pivot, float))
+    return axis, pivot + np.asarray(pose.translation, float)[parents]
 
 
 def joint_segments(pose: ArticulatedPose, category: Category) -> Float[np.ndarray, "joints 2 3"]:

@@ -17,7 +17,6 @@ from _helpers.depth_videos import write_video
 from _helpers.frames import random_frames, random_pose
 from _helpers.quick import quick_jit
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from caper_jax import categories, cli
 from caper_jax.cli import realsense, track_live, track_videos
@@ -26,7 +25,6 @@ from caper_jax.data import hdf5
 from caper_jax.data.live import pack_frame, read_frames
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator
-from caper_jax.evaluation.records import frame_record
 from caper_jax.evaluation.tracking import Track, format_tracks
 from caper_jax.tracker import Tracker
 from caper_jax.tracking.step import TrackResult
@@ -305,30 +303,6 @@ class TestLive:
 
 class TestReport:
     """Records and tables of any category."""
-
-    def result(self, pose=None):
-        return TrackResult(pose or arm_pose(), None, np.float32(0.02), True, False, False)
-
-    def test_units_and_frames(self):
-        record = frame_record("f", self.result(), ARM, 0.0125)
-        assert list(record["parts"]) == ["base", "link", "slider"]
-        link, slider = record["joints"]["link"], record["joints"]["slider"]
-        assert (link["type"], link["unit"]) == ("revolute", "degrees")
-        assert link["state"] == pytest.approx(40.107046) and link["pivot_rest"] == [0.02, 0.05, -0.03]
-        assert (slider["type"], slider["unit"]) == ("prismatic", "meters")
-        assert slider["state"] == pytest.approx(0.08) and slider["pivot_rest"] is None
-        assert slider["axis_rest"] == [1.0, 0.0, 0.0]
-        turned = np.array(record["parts"]["link"]["rotation"])
-        base = np.array(record["parts"]["base"]["rotation"])
-        angle = Rotation.from_matrix(base.T @ turned).magnitude()
-        assert np.degrees(angle) == pytest.approx(link["state"], abs=1e-4)
-        assert record["milliseconds"] == 12.5 and record["energy"] == 0.02
-        assert (record["keyframe"], record["estimated"], record["lost"]) == (True, False, False)
-
-    def test_a_pose_that_is_not_finite_is_an_error(self):
-        pose = arm_pose(np.array([np.nan, 0.0]))
-        with pytest.raises(CaperError, match="frame 3: the model gave no finite pose"):
-            frame_record(3, self.result(pose), ARM, 0.0)
 
     def track(self, name):
         pose = jax.tree.map(lambda array: np.stack([array] * 3), arm_pose())

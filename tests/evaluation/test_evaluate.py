@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 from _helpers.frames import random_frames
+from caper_jax.evaluation.breakdown import by_opening
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories, cli
@@ -15,7 +16,6 @@ from caper_jax.data.clouds import sample_points
 from caper_jax.data.hdf5 import Hdf5Dataset, write
 from caper_jax.errors import CaperError
 from caper_jax.evaluation import protocol, report
-from caper_jax.evaluation.breakdown import by_opening
 from caper_jax.evaluation.metrics import PoseErrors
 from caper_jax.geometry.raster_order import raster_order
 

@@ -51,9 +51,7 @@ def test_the_truth_scores_perfectly(known, tmp_path, capsys):
     assert "2 frames of" in capsys.readouterr().out
 
 
-def test_a_failure_counts_with_the_distance_over_the_diagonal(
-    known, tmp_path, capsys, monkeypatch
-):
+def test_a_failure_counts_with_the_distance_over_the_diagonal(known, tmp_path, capsys, monkeypatch):
     def fails(frames, points):
         pose = protocol.truth_predictor(frames, points)
         return pose.replace(rotation=np.full_like(pose.rotation, np.nan))
