@@ -123,11 +123,10 @@ def measured() -> dict[str, tuple[Callable[[], Any], Callable[[], Any]]]:
     import jax.numpy as jnp
     import numpy as np
 
-    from benchmarks import iou, naive, se3, training
-    from benchmarks.models import clouds
+    from benchmarks import iou, se3, training
+    from benchmarks.models import clouds, encoders
     from caper_jax.config import HSEncoderConfig
     from caper_jax.estimator import load
-    from caper_jax.models.encoders.hs import HSEncoder
     from caper_jax.tracker import Tracker
 
     estimator = load("laptop")
@@ -136,21 +135,12 @@ def measured() -> dict[str, tuple[Callable[[], Any], Callable[[], Any]]]:
     matmul, sines = timing.matmul(), timing.elementwise()
 
     # A quarter of the published width, so that the naive form compiles and runs in seconds.
-    module = HSEncoder(HSEncoderConfig(channels=(32, 32, 64, 64, 128)))
-    variables = jax.jit(lambda x: module.init(jax.random.key(0), x, train=False))(points[:1])
-
-    def encoder() -> Callable[[], Any]:
-        def total(weights: Any, x: Any) -> Any:
-            features: Any = module.apply({**variables, "params": weights}, x, train=False)
-            return sum((jnp.sum(level.features**2) for level in features.levels), jnp.zeros(()))
-
-        function = jax.jit(jax.value_and_grad(total))
-        function(variables["params"], points[:1])  # traced here
-        return lambda: function(variables["params"], points[:1])
-
-    fast_encoder = encoder()
-    with naive.formulation():
-        naive_encoder = encoder()
+    config = HSEncoderConfig(channels=(32, 32, 64, 64, 128))
+    weights, fast, naive = encoders(config, points[:1])
+    fast_encoder, naive_encoder = (
+        jax.jit(jax.grad(lambda weights, encode=encode: jnp.sum(encode(weights) ** 2)))
+        for encode in (fast, naive)
+    )
 
     twists = jax.device_put(se3.twists(_TWISTS))
     functions = {name: jax.jit(function) for name, function in se3.functions().items()}
@@ -160,7 +150,10 @@ def measured() -> dict[str, tuple[Callable[[], Any], Callable[[], Any]]]:
         f"estimator, batch {_BATCH}": (lambda: estimator(points), matmul),
         "tracker, one step": (lambda: tracker(np.asarray(points[0])), matmul),
         "fast, training step": (training.make("laptop", "fast").call, matmul),
-        "HS-Encoder with gradient": (fast_encoder, naive_encoder),
+        "HS-Encoder with gradient": (
+            lambda: fast_encoder(weights),
+            lambda: naive_encoder(weights),
+        ),
         "se(3) exp": (lambda: functions["exp"](twists), sines),
         "se(3) log": (lambda: functions["log"](transforms), sines),
         "se(3) gradient": (lambda: functions["exp+log, gradient"](twists), sines),

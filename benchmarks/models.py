@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from caper_jax.articulation.category import Category
-from caper_jax.config import NetworkConfig
+from caper_jax.config import HSEncoderConfig, NetworkConfig
 from caper_jax.estimator import Estimator
 
 
@@ -27,6 +28,26 @@ def random_estimator(category: Category, network: NetworkConfig) -> Estimator:
         sides = module.init(jax.random.key(1), features)["params"]
         variables = {**variables, "params": {**variables["params"], "refiner": sides}}
     return Estimator(category, network, variables)
+
+
+def encoders(
+    config: HSEncoderConfig, points: Any
+) -> tuple[Any, Callable[[Any], Any], Callable[[Any], Any]]:
+    """(weights, ours, the naive formulation): functions of weights that give [B, N, C] features."""
+    import jax
+    import jax.numpy as jnp
+
+    from benchmarks import naive
+    from caper_jax.models.encoders.hs import HSEncoder
+
+    module = HSEncoder(config)
+    variables = jax.jit(lambda x: module.init(jax.random.key(0), x, train=False))(points[:1])
+
+    def ours(weights: Any) -> Any:
+        levels = module.apply(weights, points, train=False).levels
+        return jnp.concatenate([level.at_points(level.features) for level in levels], -1)
+
+    return variables, ours, lambda weights: naive.hs_encoder(weights, points, config)
 
 
 def clouds(category: Category, batch: int, num_points: int = 1024) -> np.ndarray:
