@@ -133,11 +133,11 @@ def network(preset: str, category: str) -> Network:
     import jax
 
     from caper_jax import categories
+    from caper_jax import config as presets
     from caper_jax.config import LossConfig
-    from caper_jax.config import preset as sizes
     from caper_jax.training.objective import Objective
 
-    task = Objective(categories.get(category), sizes(preset), LossConfig())
+    task = Objective(categories.get(category), presets.preset(preset).network, LossConfig())
     shapes = jax.eval_shape(task.init, jax.random.key(0))
     gradients = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes["params"]))
     # A mean and a variance each.

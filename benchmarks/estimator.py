@@ -114,7 +114,7 @@ def _paper(name: str, batch: int, repeats: int, rounded: bool) -> dict[str, Any]
     from caper_jax import categories
     from caper_jax.config import preset
 
-    category, network = categories.get(name), preset("paper")
+    category, network = categories.get(name), preset("paper").network
     estimator = random_estimator(category, network)
     points = clouds(category, batch)
     call, cost = _call(estimator, points)

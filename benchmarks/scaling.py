@@ -60,9 +60,9 @@ def _measure(preset: str, points: int, parts: int, batch: int, repeats: int) -> 
     import numpy as np
 
     from benchmarks.models import chain, random_estimator
-    from caper_jax.config import preset as sizes
+    from caper_jax import config
 
-    network = dataclasses.replace(sizes(preset), num_points=points)
+    network = dataclasses.replace(config.preset(preset).network, num_points=points)
     estimator = random_estimator(chain(parts), network)
     rng = np.random.default_rng(0)
     clouds = (rng.uniform(-0.2, 0.2, (batch, points, 3)) + [0.0, 0.0, 1.0]).astype(np.float32)
