@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from _helpers.frames import random_frames
-from caper_jax.evaluation.breakdown import by_opening
+from caper_jax.evaluation.report import errors_by_opening
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories, cli
@@ -133,7 +133,7 @@ def test_the_joint_that_is_most_open_counts():
     states[:, 1] = low + shares * (high - low)
     values = np.arange(4.0 * len(shares)).reshape(-1, 4)
     errors = PoseErrors(**{f.name: values for f in dataclasses.fields(PoseErrors)})
-    bins = by_opening(errors, states, drawer)
+    bins = errors_by_opening(errors, states, drawer)
     for content, rows in zip(bins, (values[:3], values[3:5], values[5:]), strict=True):
         assert [part["frames"] for part in content["parts"]] == [len(rows)] * 4
         means = [part["rotation_deg"]["mean"] for part in content["parts"]]
@@ -144,7 +144,7 @@ def test_glasses_open_as_their_states_fall_and_arms_not_at_all():
     glasses = categories.get("eyeglasses")
     errors = PoseErrors(**{f.name: np.zeros((1, 3)) for f in dataclasses.fields(PoseErrors)})
     folded = np.array([[joint.limits[1] for joint in glasses.joints]])
-    bins = by_opening(errors, folded, glasses)
+    bins = errors_by_opening(errors, folded, glasses)
     assert [content["parts"][0]["frames"] for content in bins] == [1, 0, 0]
     assert categories.get("robotarm").closed is None
 
@@ -176,7 +176,7 @@ def test_every_figure_can_be_computed_from_the_predictions(path, tmp_path, estim
             assert part[name]["mean"] == pytest.approx(values.mean(), rel=1e-4)
             assert part[name]["median"] == pytest.approx(np.median(values), rel=1e-4)
         assert part["iou_size"]["mean"] == pytest.approx(iou.mean(), rel=1e-5)
-        assert part["turned"] == (degrees > 30).mean()
+        assert part["flipped"] == (degrees > 30).mean()
     axis, true_axis = saved["joint_axis"][:, 0], saved["truth_joint_axis"][:, 0]
     offset = saved["joint_pivot"][:, 0] - saved["truth_joint_pivot"][:, 0]
     joint = metrics["joints"][0]
@@ -216,7 +216,7 @@ def test_mean_predictor_runs_from_the_card(path, tmp_path, estimator, capsys):
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["frames"] == 5 and metrics["predictor"] == "mean"
     for broken, message in (
-        ({k: v for k, v in MEAN_POSE.items() if k != "offset"}, "mean_pose lacks 'offset'"),
+        ({k: v for k, v in MEAN_POSE.items() if k != "offset"}, "mean_pose offset must be finite numbers (3,)"),
         ({**MEAN_POSE, "size": [1, 2, 3]}, "mean_pose size must be finite numbers (2, 3)"),
     ):
         estimator.card = {"mean_pose": broken}
@@ -276,7 +276,7 @@ def test_the_worst_frames_are_named_and_drawn(path, tmp_path, monkeypatch, capsy
 
 
 @pytest.mark.parametrize("name", ["eyeglasses", "robotarm"])
-def test_tables_of_long_names_fit_a_terminal_and_say_what_is_turned(name):
+def test_tables_of_long_names_fit_a_terminal_and_say_what_is_flipped(name):
     category = categories.get(name)
     turn = np.full((4, category.num_parts), 12.3)
     turn[0] = 123.4
@@ -285,7 +285,7 @@ def test_tables_of_long_names_fit_a_terminal_and_say_what_is_turned(name):
     lines = report.format_tables(tables)
     assert max(map(len, lines)) <= 80
     said = " ".join(lines[category.num_parts + 1 : lines.index("")])
-    assert said == "over 30 deg: " + ", ".join(f"{part} 25.0 %" for part in category.parts)
+    assert said == "flipped (over 30 deg): " + ", ".join(f"{part} 25.0 %" for part in category.parts)
 
 
 def test_frames_that_fail_are_counted_not_dropped(path, tmp_path):
@@ -307,7 +307,7 @@ def test_frames_that_fail_are_counted_not_dropped(path, tmp_path):
     result = report.summarize(evaluation, dataset, "model", "here")
     assert (result["frames"], result["failures"]) == (FRAMES, 2)
     assert result["parts"][0]["rotation_deg"]["mean"] == pytest.approx(2 * 180 / FRAMES)
-    assert result["parts"][0]["turned"] == 2 / FRAMES
+    assert result["parts"][0]["flipped"] == 2 / FRAMES
     assert result["parts"][0]["iou_full"]["mean"] == pytest.approx((FRAMES - 2) / FRAMES)
     assert result["parts"][1]["rotation_deg"]["median"] == 0
     report.write_report(tmp_path, evaluation, result)
@@ -363,7 +363,7 @@ def test_mistakes_are_one_line_and_code_2(path, tmp_path, capsys, options, messa
 
 
 def test_output_problems_are_found_before_any_work(path, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("caper_jax.data.open_dataset", lambda *_: pytest.fail("began to work"))
+    monkeypatch.setattr("caper_jax.data.readers.open_dataset", lambda *_: pytest.fail("began to work"))
     assert run(path, path, "--predictor", "truth") == 2
     assert "is a file; give a folder" in capsys.readouterr().err
     assert run(path, path / "below", "--predictor", "truth") == 2

@@ -6,11 +6,11 @@ import pytest
 from _helpers.formats import FORMATS, write_root
 
 from caper_jax import cli
-from caper_jax import data as datasets
+from caper_jax.data import readers
 
 
 def test_every_format_is_here():
-    assert sorted(FORMATS) == sorted(datasets.FORMATS)
+    assert sorted(FORMATS) == sorted(readers.FORMATS)
 
 
 @pytest.mark.parametrize("format", FORMATS)

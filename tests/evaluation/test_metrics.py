@@ -21,8 +21,8 @@ BOX = categories.get("box")
 FRAMES = 12
 
 
-def turned(pose, rotvec, moved=(0.0, 0.0, 0.0)):
-    """Every part turned about its own origin, and moved, both in the camera's frame."""
+def rotated(pose, rotvec, moved=(0.0, 0.0, 0.0)):
+    """Every part rotated about its own origin, and moved, both in the camera's frame."""
     turn = Rotation.from_rotvec(rotvec).as_matrix()
     return pose.replace(
         rotation=np.einsum("ij,...jk->...ik", turn, pose.rotation.astype(float)),
@@ -46,14 +46,14 @@ def test_the_truth_scores_perfectly():
 def test_rotation_error_is_the_angle_never_folded(angle):
     truth = random_pose(FRAMES)
     axis = np.array([1, 2, -2]) / 3
-    errors = pose_errors(turned(truth, np.radians(angle) * axis), truth, BOX)
+    errors = pose_errors(rotated(truth, np.radians(angle) * axis), truth, BOX)
     # The truth is float32, so orthonormal to 1e-7 only.
     np.testing.assert_allclose(errors.rotation_deg, angle, atol=2e-5)
 
 
 def test_translation_is_the_distance_of_the_origins():
     truth = random_pose(FRAMES)
-    errors = pose_errors(turned(truth, [0, 0, 0], (0.003, -0.004, 0.012)), truth, BOX)
+    errors = pose_errors(rotated(truth, [0, 0, 0], (0.003, -0.004, 0.012)), truth, BOX)
     np.testing.assert_allclose(errors.translation_m, 0.013, atol=1e-6)
 
 
@@ -64,7 +64,7 @@ def halfspaces(rotation, center, size):
 
 def test_full_iou_is_that_of_the_oriented_boxes_in_the_camera():
     truth = random_pose(FRAMES)
-    guess = turned(truth, [0.1, -0.2, 0.15], (0.004, 0.003, -0.005))
+    guess = rotated(truth, [0.1, -0.2, 0.15], (0.004, 0.003, -0.005))
     guess = guess.replace(size=1.2 * truth.size, box_center=truth.box_center + 0.002)
     found = pose_errors(guess, truth, BOX).iou_full
     for frame, part in itertools.product(range(FRAMES), range(2)):
@@ -82,7 +82,7 @@ def test_full_iou_is_that_of_the_oriented_boxes_in_the_camera():
 
 def test_size_iou_ignores_where_the_boxes_are():
     truth = random_pose(FRAMES)
-    guess = turned(truth, [1, 1, 1], (1, 1, 1)).replace(size=truth.size * [2, 0.5, 1])
+    guess = rotated(truth, [1, 1, 1], (1, 1, 1)).replace(size=truth.size * [2, 0.5, 1])
     errors = pose_errors(guess, truth, BOX)
     np.testing.assert_allclose(errors.iou_size, 0.5 / (1 + 1 - 0.5), rtol=1e-6)
     assert (errors.iou_full == 0).all()
@@ -195,8 +195,8 @@ def corners(pose):
     """[F, K, 8, 3] corners of all boxes in the camera's frame."""
     signs = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
     rest = pose.box_center[..., None, :] + signs * pose.size[..., None, :]
-    turned_corners = np.einsum("fkij,fkcj->fkci", np.asarray(pose.rotation, float), rest)
-    return turned_corners + pose.translation[..., None, :]
+    corners_camera = np.einsum("fkij,fkcj->fkci", np.asarray(pose.rotation, float), rest)
+    return corners_camera + pose.translation[..., None, :]
 
 
 CYCLE = ((0, 0, 1), (-1, 0, 0), (0, -1, 0))
@@ -206,14 +206,14 @@ CYCLE = ((0, 0, 1), (-1, 0, 0), (0, -1, 0))
     ("category", "pose", "symmetry"),
     [
         (BOX, random_pose(FRAMES), BOX.symmetries[0]),
-        # The chain read from its other end: parents and children change places.
+        # The chain seen from its other end: parents and children change places.
         (TURN_TWICE, chain_pose(TURN_TWICE), Symmetry((2, 1, 0), CYCLE, "test")),
     ],
 )
-def test_a_second_reading_is_the_same_object(category, pose, symmetry):
-    reading = apply_symmetry(pose, symmetry, category)
-    assert not pose_problems(reading, category)
-    found, expected = corners(reading), corners(pose)[:, list(symmetry.permutation)]
+def test_an_equivalent_pose_is_the_same_object(category, pose, symmetry):
+    other = apply_symmetry(pose, symmetry, category)
+    assert not pose_problems(other, category)
+    found, expected = corners(other), corners(pose)[:, list(symmetry.permutation)]
     distance = np.linalg.norm(found[..., :, None, :] - expected[..., None, :, :], axis=-1)
     assert distance.min(-1).max() < 1e-6 and distance.min(-2).max() < 1e-6
 
@@ -223,13 +223,13 @@ def alike(size):
     return size @ np.abs(np.array(BOX.symmetries[0].turn))
 
 
-def test_errors_up_to_symmetry_take_the_better_reading_of_each_frame():
+def test_errors_up_to_symmetry_take_the_better_truth_of_each_frame():
     truth = random_pose(FRAMES)
     truth.size[:, 1] = alike(truth.size[:, 0])
     other = apply_symmetry(truth, BOX.symmetries[0], BOX)
     swapped = np.arange(FRAMES) % 3 == 0
     guess = mixed(swapped, other, truth)
-    guess = turned(guess, [0.02, 0, 0], (0, 0.001, 0))
+    guess = rotated(guess, [0.02, 0, 0], (0, 0.001, 0))
     plain, symmetric = (f(guess, truth, BOX) for f in (pose_errors, pose_errors_up_to_symmetry))
     np.testing.assert_allclose(symmetric.rotation_deg, np.degrees(0.02), atol=1e-5)
     np.testing.assert_allclose(symmetric.translation_m, 0.001, atol=1e-6)

@@ -216,13 +216,13 @@ def test_table_fits_80_columns_and_states_known_errors():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"points": np.full((48, 3), np.nan)}, "points must be finite"),
-        ({"labels": np.full(48, 3)}, "labels must be 0 to 2"),
-        ({"labels": np.zeros(5, int)}, "labels has shape"),
-        ({"pose": replace(arm_pose(), joint_state=np.array([np.nan, 0]))}, "pose.joint_state"),
-        ({"truth": replace(arm_pose(), size=np.zeros((2, 3)))}, "truth.size"),
-        ({"intrinsics": None}, "depth needs intrinsics"),
-        ({"mask": np.zeros((3, 3), bool)}, "mask is"),
+        ({"points": np.full((48, 3), np.nan)}, "points"),
+        ({"labels": np.full(48, 3)}, "labels must be parts 0 to 2"),
+        ({"labels": np.zeros(5, int)}, "labels"),
+        ({"pose": replace(arm_pose(), joint_state=np.array([np.nan, 0]))}, "estimate joint_state"),
+        ({"truth": replace(arm_pose(), size=np.zeros((2, 3)))}, "truth size"),
+        ({"intrinsics": None}, "intrinsics"),
+        ({"mask": np.zeros((3, 3), bool)}, "mask"),
     ],
 )
 def test_scene_names_what_is_wrong(changes: dict, message: str):
