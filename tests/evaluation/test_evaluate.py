@@ -8,7 +8,6 @@ import jax
 import numpy as np
 import pytest
 from _helpers.frames import random_frames
-from caper_jax.evaluation.report import errors_by_opening
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories, cli
@@ -17,6 +16,7 @@ from caper_jax.data.hdf5 import Hdf5Dataset, write
 from caper_jax.errors import CaperError
 from caper_jax.evaluation import protocol, report
 from caper_jax.evaluation.metrics import PoseErrors
+from caper_jax.evaluation.report import errors_by_opening
 from caper_jax.geometry.raster_order import raster_order
 
 BOX = categories.get("box")
@@ -216,7 +216,10 @@ def test_mean_predictor_runs_from_the_card(path, tmp_path, estimator, capsys):
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["frames"] == 5 and metrics["predictor"] == "mean"
     for broken, message in (
-        ({k: v for k, v in MEAN_POSE.items() if k != "offset"}, "mean_pose offset must be finite numbers (3,)"),
+        (
+            {k: v for k, v in MEAN_POSE.items() if k != "offset"},
+            "mean_pose offset must be finite numbers (3,)",
+        ),
         ({**MEAN_POSE, "size": [1, 2, 3]}, "mean_pose size must be finite numbers (2, 3)"),
     ):
         estimator.card = {"mean_pose": broken}
@@ -285,7 +288,9 @@ def test_tables_of_long_names_fit_a_terminal_and_say_what_is_flipped(name):
     lines = report.format_tables(tables)
     assert max(map(len, lines)) <= 80
     said = " ".join(lines[category.num_parts + 1 : lines.index("")])
-    assert said == "flipped (over 30 deg): " + ", ".join(f"{part} 25.0 %" for part in category.parts)
+    assert said == "flipped (over 30 deg): " + ", ".join(
+        f"{part} 25.0 %" for part in category.parts
+    )
 
 
 def test_frames_that_fail_are_counted_not_dropped(path, tmp_path):
@@ -363,7 +368,9 @@ def test_mistakes_are_one_line_and_code_2(path, tmp_path, capsys, options, messa
 
 
 def test_output_problems_are_found_before_any_work(path, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("caper_jax.data.readers.open_dataset", lambda *_: pytest.fail("began to work"))
+    monkeypatch.setattr(
+        "caper_jax.data.readers.open_dataset", lambda *_: pytest.fail("began to work")
+    )
     assert run(path, path, "--predictor", "truth") == 2
     assert "is a file; give a folder" in capsys.readouterr().err
     assert run(path, path / "below", "--predictor", "truth") == 2

@@ -25,9 +25,9 @@ from caper_jax.errors import CaperError
 from caper_jax.estimator import Prediction
 from caper_jax.visualization import picture
 from caper_jax.visualization import scene as scenes
-from caper_jax.visualization.plots import save_figure
 from caper_jax.visualization.page import write_page
 from caper_jax.visualization.picture import write_picture
+from caper_jax.visualization.plots import save_figure
 from caper_jax.visualization.scene import Scene
 from caper_jax.visualization.table import format_scene
 
