@@ -79,7 +79,7 @@ def calls(size: int, numbers: int) -> dict[str, Callable[[], Any]]:
     a, b = (jax.random.normal(key, (size, size)) for key in keys[:2])
     low = a.astype(jnp.bfloat16), b.astype(jnp.bfloat16)
     values = jax.random.normal(keys[2], (numbers,))
-    # With the sign turned: a bare copy might be left out.
+    # Negated: the compiler might leave out a bare copy.
     copy = jax.jit(lambda x: -x)
     product = jax.jit(lambda x, y: x @ y)
     exact = jax.jit(lambda x, y: jnp.matmul(x, y, precision="highest"))

@@ -116,18 +116,18 @@ def _jaxlie() -> dict[str, Callable[[Any], Any]]:
     import jax.numpy as jnp
     import jaxlie
 
-    def turned(xi: Any) -> Any:
+    def reordered(xi: Any) -> Any:
         return jnp.concatenate([xi[..., 3:], xi[..., :3]], -1)
 
     def exp(xi: Any) -> Any:
-        return jaxlie.SE3.exp(turned(xi)).as_matrix()
+        return jaxlie.SE3.exp(reordered(xi)).as_matrix()
 
     def log(transform: Any) -> Any:
-        return turned(jaxlie.SE3.from_matrix(transform).log())
+        return reordered(jaxlie.SE3.from_matrix(transform).log())
 
     def gradient(xi: Any) -> Any:
         def total(x: Any) -> Any:
-            return (turned(jaxlie.SE3.exp(turned(x)).log()) * _slope(x)).sum()
+            return (reordered(jaxlie.SE3.exp(reordered(x)).log()) * _slope(x)).sum()
 
         return jax.grad(total)(xi)
 
