@@ -22,9 +22,10 @@ from caper_jax.errors import CaperError
 from caper_jax.geometry.frames import rotate, view_rotation
 from caper_jax.models import uncertainty
 from caper_jax.models.files import CARD_FILE, flatten, read_model
-from caper_jax.models.networks import PartsNetwork, RootNetwork
+from caper_jax.models.parts import PartsNetwork
 from caper_jax.models.pipeline import articulated_pose, read, refinements
 from caper_jax.models.refiner import BoxRefiner, num_features
+from caper_jax.models.root import RootNetwork
 from caper_jax.models.uncertainty import Calibration
 
 

@@ -17,11 +17,11 @@ from caper_jax.geometry.raster_order import from_raster_order, raster_order, to_
 from caper_jax.geometry.two_axis_rotation import rotation_from_directions
 from caper_jax.lie import se3
 from caper_jax.models import uncertainty
-from caper_jax.models.increment import increment_transform
-from caper_jax.models.networks import PartsNetwork, RootNetwork, shared_neighborhoods
+from caper_jax.models.encoders import shared_neighborhoods
+from caper_jax.models.parts import PartsNetwork, increment_transform, vote
 from caper_jax.models.refiner import BoxRefiner, StageEstimate, apply_residual, refiner_features
+from caper_jax.models.root import RootNetwork
 from caper_jax.models.rotation_classes import rotate_pose, select_rotation
-from caper_jax.models.voting import vote
 
 # Part sizes are residuals to a mean; nothing else keeps a regression from going below zero.
 SMALLEST_SIZE = 0.01  # of the mean

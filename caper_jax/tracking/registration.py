@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from caper_jax.articulation.joints import joint_transforms
+from caper_jax.articulation.kinematics import joint_transforms
 from caper_jax.config import RegistrationConfig
 from caper_jax.lie import linalg, se3
 from caper_jax.models.encoders.neighbors import gather, smallest, squared_distances

@@ -16,10 +16,9 @@ from caper_jax.config import NetworkConfig, RegistrationConfig, TrackerConfig
 from caper_jax.lie import se3
 from caper_jax.models.pipeline import SMALLEST_SIZE
 from caper_jax.models.rotation_classes import NUM_CUBE_ROTATIONS
-from caper_jax.tracking.energy import chamfer_energy
-from caper_jax.tracking.joints import joints_from_poses
 from caper_jax.tracking.keyframes import (
     added,
+    chamfer_energy,
     corrected,
     grown_surface,
     is_keyframe,
@@ -34,6 +33,7 @@ from caper_jax.tracking.measurement import (
     averaged,
     box_residual,
     diagonal,
+    joints_from_poses,
     measure,
 )
 from caper_jax.tracking.registration import (

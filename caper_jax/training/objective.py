@@ -24,9 +24,9 @@ from caper_jax.geometry.frames import (
 from caper_jax.geometry.raster_order import raster_order, to_raster_order
 from caper_jax.geometry.two_axis_rotation import rotation_from_directions
 from caper_jax.lie import se3, so3
-from caper_jax.models.increment import increment_numbers, increment_transform
 from caper_jax.models.layers import after
-from caper_jax.models.networks import PartsNetwork, RootNetwork
+from caper_jax.models.parts import PartsNetwork, increment_numbers, increment_transform, vote
+from caper_jax.models.root import RootNetwork
 from caper_jax.models.rotation_classes import (
     CUBE_ROTATIONS,
     HALF_TURNS,
@@ -34,7 +34,6 @@ from caper_jax.models.rotation_classes import (
     nearest_cube_rotation,
     rotate_pose,
 )
-from caper_jax.models.voting import vote
 from caper_jax.training import losses
 from caper_jax.training.eager_gradient import value_with_eager_gradient
 

@@ -10,7 +10,7 @@ import pytest
 from caper_jax import categories
 from caper_jax.articulation.category import Category, Joint, Symmetry
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.instances import draw_instances
 
 NAMES = categories.names()

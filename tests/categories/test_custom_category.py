@@ -20,7 +20,7 @@ from caper_jax.data import hdf5
 from caper_jax.data.readers import open_dataset
 from caper_jax.errors import CaperError
 from caper_jax.estimator import load
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.models.files import write_model
 from caper_jax.synthetic.instances import build_bank, draw_instances
 from caper_jax.training import train as run

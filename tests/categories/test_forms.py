@@ -8,8 +8,7 @@ from _helpers.solid_points import inside, loose
 from scipy.spatial.transform import Rotation
 
 from caper_jax.categories.forms import about, along, beam, chain, mirrored, turned
-from caper_jax.geometry.solid_bounds import bounds
-from caper_jax.geometry.solids import box, cone, cylinder, ellipsoid, frustum
+from caper_jax.geometry.solids import bounds, box, cone, cylinder, ellipsoid, frustum
 
 RNG = np.random.default_rng(0)
 TILT = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()

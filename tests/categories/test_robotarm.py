@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.categories.robotarm import _FAMILIES, ROBOTARM, chains
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.instances import draw_instances
 
 HALF = np.pi / 2

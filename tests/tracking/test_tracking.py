@@ -17,12 +17,17 @@ from scipy.spatial.transform import Rotation
 from caper_jax import categories
 from caper_jax.config import TrackerConfig
 from caper_jax.errors import CaperError
-from caper_jax.models.increment import increment_numbers, increment_transform
+from caper_jax.models.parts import increment_numbers, increment_transform
 from caper_jax.models.rotation_classes import CUBE_ROTATIONS, NUM_CUBE_ROTATIONS
 from caper_jax.tracking import keyframes
-from caper_jax.tracking.energy import chamfer_energy
-from caper_jax.tracking.joints import joints_from_poses
-from caper_jax.tracking.measurement import PoseMeasurement, averaged, box_residual, diagonal
+from caper_jax.tracking.keyframes import chamfer_energy
+from caper_jax.tracking.measurement import (
+    PoseMeasurement,
+    averaged,
+    box_residual,
+    diagonal,
+    joints_from_poses,
+)
 from caper_jax.tracking.state import ObjectParameters
 
 LAPTOP = categories.get("laptop")

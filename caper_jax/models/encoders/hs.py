@@ -151,6 +151,11 @@ class HSEncoder(nn.Module):
 
     config: HSEncoderConfig = HSEncoderConfig()
 
+    @nn.nowrap
+    def neighborhoods(self, points) -> Neighborhoods:
+        """``neighborhoods`` of points [B, N, 3] as evaluation pools them."""
+        return neighborhoods(points, self.config)
+
     @nn.compact
     def __call__(self, points, train: bool, space: Neighborhoods | None = None) -> Features:
         """points [B, N, 3], centered, network units -> Features at N, N/4 and N/16 points.

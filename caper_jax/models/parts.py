@@ -1,4 +1,8 @@
-"""The two networks of CAPER++: root pose (Sec 5.1) and constrained parts (Sec 5.2, 5.3)."""
+"""Stage II: the root's increment, the joints by voting, joint states, sizes and segmentation.
+
+Sec 5.2 of the paper, and Sec 5.3, where a tracker shows it a cloud in the canonical space of a
+keyframe.
+"""
 
 from __future__ import annotations
 
@@ -9,96 +13,14 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from caper_jax.config import (
-    HeadConfig,
-    IncrementKind,
-    NetworkConfig,
-)
-from caper_jax.models.encoders.fast import FastEncoder
-from caper_jax.models.encoders.hs import HSEncoder, Neighborhoods, neighborhoods
+from caper_jax.config import HeadConfig, IncrementKind, NetworkConfig
+from caper_jax.geometry.two_axis_rotation import rotation_from_directions
+from caper_jax.lie import se3
+from caper_jax.models.encoders import encode
 from caper_jax.models.heads import PointHead, PooledHead, unit_vectors
 from caper_jax.models.rotation_classes import NUM_CUBE_ROTATIONS
 
 _INCREMENT_SIZE: dict[IncrementKind, int] = {"lie": 6, "euclidean": 9}
-
-
-def make_encoder(config: NetworkConfig) -> nn.Module:
-    """The encoder that a config names: (points [B, N, 3], train) -> Features."""
-    if config.encoder == "hs":
-        return HSEncoder(config.hs, name="encoder")
-    return FastEncoder(config.fast, name="encoder")
-
-
-def shared_neighborhoods(config: NetworkConfig, points) -> Neighborhoods | None:
-    """What both stages may use in evaluation: neighbors do not change with the pose.
-
-    Args:
-      config: sizes.
-      points: [B, N, 3] the cloud, in any pose, network units.
-
-    Returns:
-      None for an encoder that searches no neighbors.
-    """
-    if config.encoder != "hs":
-        return None
-    return neighborhoods(points - points.mean(axis=1, keepdims=True), config.hs)
-
-
-def _encode(config: NetworkConfig, points, train: bool, space: Neighborhoods | None):
-    encoder = make_encoder(config)
-    return encoder(points, train) if space is None else encoder(points, train, space)
-
-
-@flax.struct.dataclass
-class RootOutput:
-    """Stage I, in the frame and units of its input cloud.
-
-    Attributes:
-      directions: [B, 2, 3] unit vectors, two axes of the root's frame.
-      confidence: [B, 2] in (0, 1); the correction factors of Eq 3.
-      translation: [B, 3].
-    """
-
-    directions: Any
-    confidence: Any
-    translation: Any
-
-
-class RootNetwork(nn.Module):
-    """Stage I: two directions with confidence, and the translation as a residual to the mean."""
-
-    config: NetworkConfig
-
-    @nn.compact
-    def __call__(self, points, train: bool, space: Neighborhoods | None = None) -> RootOutput:
-        """points [B, N, 3], network units -> RootOutput; see ``shared_neighborhoods``."""
-        mean = points.mean(axis=1, keepdims=True)
-        features = _encode(self.config, points - mean, train, space)
-        heads = self.config.root_heads
-        residual = PooledHead(3, heads, with_points=True, name="translation")(features, train)
-        if self.config.rotation == "quaternion":
-            numbers = PooledHead(4, heads, name="quaternion")(features, train)
-            directions = quaternion_axes(numbers)
-            confidence = jnp.full(directions.shape[:2], 0.5, directions.dtype)
-        else:
-            raw = jnp.stack(
-                [PooledHead(4, heads, name=f"direction{i}")(features, train) for i in range(2)],
-                axis=1,
-            )
-            directions, confidence = unit_vectors(raw[..., 1:]), jax.nn.sigmoid(raw[..., 0])
-            if not self.config.vertical_correction:
-                confidence = jnp.broadcast_to(
-                    jnp.array([1.0, 0.0], confidence.dtype), confidence.shape
-                )
-        return RootOutput(directions, confidence, residual + mean[:, 0])
-
-
-def quaternion_axes(numbers):
-    """Two axes at right angles, [B, 2, 3], from [B, 4]: a quaternion less the identity's."""
-    w, x, y, z = jnp.moveaxis(unit_vectors(numbers + jnp.array([1.0, 0, 0, 0])), -1, 0)
-    first = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
-    second = jnp.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1)
-    return jnp.stack([first, second], axis=1)
 
 
 @flax.struct.dataclass
@@ -110,7 +32,7 @@ class PartsOutput:
     that reference; everything else is said of the true canonical frame.
 
     Attributes:
-      increment: [B, 6] or [B, 9], see ``models.increment``; zero where the reference is right.
+      increment: [B, 6] or [B, 9], see ``increment_transform``; zero where the reference is right.
       turn: [B, 24] logits of ``models.rotation_classes``: which one the reference needs, before the
         increment; None without that head.
       segmentation: [B, N, K] logits.
@@ -145,7 +67,7 @@ class PartsNetwork(nn.Module):
     num_parts: int
 
     @nn.compact
-    def __call__(self, points, train: bool, space: Neighborhoods | None = None) -> PartsOutput:
+    def __call__(self, points, train: bool, space: Any = None) -> PartsOutput:
         """points [B, N, 3], canonicalized, network units -> PartsOutput.
 
         In training N is divided by ``config.point_stride`` in the point-wise outputs. See
@@ -154,7 +76,7 @@ class PartsNetwork(nn.Module):
         parts, joints = self.num_parts, self.num_parts - 1
         batch = points.shape[0]
         # Not centered: where the origin lies is what stage I has found out.
-        features = _encode(self.config, points, train, space)
+        features = encode(self.config, points, train, space)
         chosen = features.every(self.config.point_stride) if train else features
         pointwise = self.config.point_heads
         segmentation = PointHead(parts, pointwise, name="segmentation")(chosen, train)
@@ -201,3 +123,51 @@ def _unanimous(points, joints):
     shape = (points.shape[0], points.shape[1], joints.shape[1])
     axis = jnp.broadcast_to(joints[:, None, :, :3], (*shape, 3))
     return jnp.ones(shape, points.dtype), joints[:, None, :, 3:] - points[:, :, None], axis
+
+
+def vote(points, heatmap, offset, direction):
+    """Joint pivot and direction as heatmap-weighted means of the points' votes.
+
+    The weights are divided by their sum: with the 1/N of the printed equations the pivot shrinks
+    towards the origin (errata). The pivot is a point on the axis; where along it is arbitrary.
+
+    Args:
+      points: [B, N, 3].
+      heatmap: [B, N, J] >= 0.
+      offset: [B, N, J, 3] from each point to its foot on the axis.
+      direction: [B, N, J, 3].
+
+    Returns:
+      axis [B, J, 3] unit vectors and pivot [B, J, 3].
+    """
+    weight = heatmap + 1e-9  # where no point has any, all have the same
+    share = weight / weight.sum(axis=1, keepdims=True)
+    pivot = (share[..., None] * (points[:, :, None, :] + offset)).sum(axis=1)
+    axis = (share[..., None] * direction).sum(axis=1)
+    return unit_vectors(axis), pivot
+
+
+def increment_transform(numbers, kind: IncrementKind) -> jax.Array:
+    """The rigid transform [..., 4, 4] that a network's output stands for.
+
+    Args:
+      numbers: "lie": [..., 6] a twist (w, rho), mapped by the exponential (Eq 14); "euclidean":
+        [..., 9] the first two axes, as differences to x and y, and the translation; the first axis
+        keeps its direction, the second is made perpendicular. Zeros give the identity in both.
+      kind: which of the two.
+    """
+    if kind == "lie":
+        return se3.exp(numbers)
+    x = numbers[..., 0:3] + jnp.array([1.0, 0.0, 0.0], numbers.dtype)
+    y = numbers[..., 3:6] + jnp.array([0.0, 1.0, 0.0], numbers.dtype)
+    rotation, _ = rotation_from_directions(x, y, 1.0, 0.0, ("x", "y"))
+    return se3.from_rt(rotation, numbers[..., 6:])
+
+
+def increment_numbers(transform, kind: IncrementKind) -> jax.Array:
+    """What a network should put out for a transform [..., 4, 4]; inverts the above."""
+    if kind == "lie":
+        return se3.log(transform)
+    axes = transform[..., :3, :2] - jnp.eye(3, dtype=transform.dtype)[:, :2]
+    axes = jnp.swapaxes(axes, -1, -2)
+    return jnp.concatenate([axes[..., 0, :], axes[..., 1, :], transform[..., :3, 3]], -1)
