@@ -30,21 +30,21 @@ class Joint:
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A second, equally right reading of the same object (a declared ambiguity).
+    """Another pose that describes the same object equally well (a declared ambiguity).
 
-    The pose of part k reads ``T'_k = T_permutation[k] @ S`` with S the rotation ``turn`` about the
-    canonical origin.
+    There the pose of part k is ``T'_k = T_permutation[k] @ S``, with S the ``rotation`` about the
+    origin of the rest frame.
 
     Attributes:
-      permutation: part k of the second reading is part ``permutation[k]`` of the first.
-      turn: [3, 3] rotation of the canonical frame.
-      reason: for people.
+      permutation: part k is then what was part ``permutation[k]``.
+      rotation: [3, 3] of the rest frame.
+      reason: why the two cannot be told apart, for documentation.
       tolerance: largest relative difference of any extent of the exchanged parts at which an
-        instance still looks the same under both readings.
+        instance still looks the same in both poses.
     """
 
     permutation: tuple[int, ...]
-    turn: tuple[tuple[float, float, float], ...]
+    rotation: tuple[tuple[float, float, float], ...]
     reason: str
     tolerance: float = 0.3
 
@@ -227,11 +227,15 @@ class Category:
         if self.closed not in ("low", "high", None):
             raise CaperError(f"{where}: closed is 'low', 'high' or None, got {self.closed!r}")
         for symmetry in self.symmetries:
-            turn = np.array(symmetry.turn, float)
+            rotation = np.array(symmetry.rotation, float)
             if sorted(symmetry.permutation) != list(range(len(self.parts))):
                 raise CaperError(
-                    f"{where}: an symmetry must permute the parts, got {symmetry.permutation}"
+                    f"{where}: a symmetry must permute the parts, got {symmetry.permutation}"
                 )
-            is_rotation = turn.shape == (3, 3) and np.allclose(turn @ turn.T, np.eye(3), atol=1e-5)
-            if not is_rotation or np.linalg.det(turn) < 0:
-                raise CaperError(f"{where}: the turn of an symmetry is not a rotation: {turn}")
+            is_rotation = rotation.shape == (3, 3) and np.allclose(
+                rotation @ rotation.T, np.eye(3), atol=1e-5
+            )
+            if not is_rotation or np.linalg.det(rotation) < 0:
+                raise CaperError(
+                    f"{where}: the rotation of a symmetry is no rotation matrix: {rotation}"
+                )

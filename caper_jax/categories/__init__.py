@@ -1,10 +1,9 @@
 """The registry of categories; one module per category holds its definition.
 
 A category of your own needs no change to this package. Write a module that defines a ``Category``;
-tests/_helpers/microwave.py in the repository is a whole one. From Python, pass the object itself to
-``Generator``, ``Objective`` or ``Estimator``, or ``register`` it once and use its name like any
-other.
-On the command line, spell it ``FILE.py:NAME`` or ``package.module:NAME``::
+tests/_helpers/microwave.py in the repository is a whole one. From Python, pass the object itself
+to ``load``, ``load_tracker``, ``Generator`` or ``train``, or ``register`` it once and use its name
+like any other. On the command line, spell it ``FILE.py:NAME`` or ``package.module:NAME``::
 
     caper generate --category microwave.py:MICROWAVE --frames 3 --images --out frames
     caper train --category microwave.py:MICROWAVE --minutes 30 --out runs/microwave
@@ -19,7 +18,8 @@ What a definition settles:
   frame, meters, y up (or ``viewpoint.up``), in the pose that is called rest, where every state is
   0; joint axes, pivots and limits in the same frame. A positive state opens.
 * ``directions``: the two axes of the root's frame that its shape shows best.
-* ``viewpoint`` and ``symmetries``: where cameras stand, and which readings are equally right.
+* ``viewpoint`` and ``symmetries``: where cameras stand, and which other poses describe the same
+  object.
 * ``unit``, network units per meter: 2 over the mean diagonal of the whole object.
 * ``mean_size`` and ``mean_center``: the means of ``size`` and ``box_center`` of
   ``build_bank(draw_instances(category, 1500, "train", 0))``.
@@ -59,12 +59,7 @@ def register(category: Category) -> Category:
       CaperError: another definition already has that name, or the definition holds lists or
         arrays where tuples belong (a category is a static argument of jitted functions).
     """
-    try:
-        hash(category)
-    except TypeError as error:
-        raise CaperError(
-            f"category {category.name!r}: use tuples, not lists or arrays, in it ({error})"
-        ) from error
+    _check_hashable(category)
     if _REGISTRY.get(category.name, category) is not category:
         raise CaperError(f"category {category.name!r} is already registered; choose another name")
     _REGISTRY[category.name] = category
@@ -85,22 +80,38 @@ def registered(name: str) -> Category:
       CaperError: unknown name; the message lists the known ones and the nearest.
     """
     if name not in _REGISTRY:
-        raise unknown_name("category", name, _REGISTRY)
+        raise CaperError(
+            f"{unknown_name('category', name, _REGISTRY)}; one of your own is FILE.py:NAME, "
+            "package.module:NAME, or registered by caper_jax.register"
+        )
     return _REGISTRY[name]
 
 
-def get(name: str) -> Category:
+def _check_hashable(category: Category) -> None:
+    try:
+        hash(category)
+    except TypeError as error:
+        raise CaperError(
+            f"category {category.name!r}: use tuples, not lists or arrays, in it ({error})"
+        ) from error
+
+
+def get(name: str | Category) -> Category:
     """The category of that name, or the one that a user's own module defines.
 
     Args:
       name: a registered name such as ``box``; or ``FILE.py:NAME`` or ``package.module:NAME``, which
-        imports the module and registers its category.
+        imports the module and registers its category; or a category itself, which need not be
+        registered.
 
     Raises:
       CaperError: unknown name (the message lists the known ones and the nearest); no such file,
         module or attribute; an attribute that is no Category; an exception while importing; or a
-        category whose name is already taken.
+        category whose name is already taken, or that is not hashable.
     """
+    if isinstance(name, Category):
+        _check_hashable(name)
+        return name
     if ":" in name:
         return register(_load(name))
     if name.endswith(".py"):

@@ -344,7 +344,7 @@ SCISSORS = Category(
     symmetries=(
         Symmetry(
             permutation=(1, 0),
-            turn=((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
+            rotation=((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
             reason="equal halves change places by a half turn about x",
             # Halves that differ have other handles, by more than this in length or width.
             tolerance=0.05,

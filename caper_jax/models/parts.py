@@ -12,6 +12,7 @@ import flax.linen as nn
 import flax.struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from caper_jax.config import HeadConfig, IncrementKind, NetworkConfig
 from caper_jax.geometry.two_axis_rotation import rotation_from_directions
@@ -32,27 +33,27 @@ class PartsOutput:
     that reference; everything else is said of the true canonical frame.
 
     Attributes:
-      increment: [B, 6] or [B, 9], see ``increment_transform``; zero where the reference is right.
-      turn: [B, 24] logits of ``models.rotation_classes``: which one the reference needs, before the
-        increment; None without that head.
-      segmentation: [B, N, K] logits.
-      heatmap: [B, N, J] in (0, 1), weight of each point's vote (Eq 5).
-      offset: [B, N, J, 3] from the point to its foot on the joint axis (Eq 4, as a vector).
-      direction: [B, N, J, 3] votes for the joint direction (Eq 7).
-      state: [B, J] radians, or network units for prismatic joints.
-      size: [B, K, 3] residual to the category's mean size.
-      center: [B, K, 3] residual to the category's mean box center.
+      increment: 6 or 9 numbers, see ``increment_transform``; zero where the reference is right.
+      rotation_class: logits of ``models.rotation_classes``: which rotation the reference needs
+        before the increment; None without that head.
+      segmentation: logits.
+      heatmap: in (0, 1), weight of each point's vote (Eq 5).
+      offset: from the point to its foot on the joint axis (Eq 4, as a vector).
+      direction: votes for the joint direction (Eq 7).
+      state: radians, or network units for prismatic joints.
+      size: residual to the category's mean size.
+      center: residual to the category's mean box center.
     """
 
-    increment: Any
-    turn: Any
-    segmentation: Any
-    heatmap: Any
-    offset: Any
-    direction: Any
-    state: Any
-    size: Any
-    center: Any
+    increment: Float[Array, "B D"]
+    rotation_class: Float[Array, "B 24"] | None
+    segmentation: Float[Array, "B N K"]
+    heatmap: Float[Array, "B N J"]
+    offset: Float[Array, "B N J 3"]
+    direction: Float[Array, "B N J 3"]
+    state: Float[Array, "B J"]
+    size: Float[Array, "B K 3"]
+    center: Float[Array, "B K 3"]
 
 
 class PartsNetwork(nn.Module):
@@ -67,15 +68,17 @@ class PartsNetwork(nn.Module):
     num_parts: int
 
     @nn.compact
-    def __call__(self, points, train: bool, space: Any = None) -> PartsOutput:
-        """points [B, N, 3], canonicalized, network units -> PartsOutput.
+    def __call__(
+        self, points: Float[Array, "B N 3"], train: bool, space: Any = None
+    ) -> PartsOutput:
+        """Points, canonicalized, network units -> PartsOutput.
 
         In training N is divided by ``config.point_stride`` in the point-wise outputs. See
         ``shared_neighborhoods`` for the last argument.
         """
         parts, joints = self.num_parts, self.num_parts - 1
         batch = points.shape[0]
-        # Not centered: where the origin lies is what stage I has found out.
+        # Not centered: where the origin lies is stage I's result.
         features = encode(self.config, points, train, space)
         chosen = features.every(self.config.point_stride) if train else features
         pointwise = self.config.point_heads
@@ -96,18 +99,19 @@ class PartsNetwork(nn.Module):
                 numbers.reshape(batch, joints, 6),
             )
         state = PooledHead(joints, pooled, name="state")(features, train)
-        numbers = _INCREMENT_SIZE[self.config.increment]
-        increment = PooledHead(numbers, pooled, name="increment")(features, train)
-        turn = None
+        size = _INCREMENT_SIZE[self.config.increment]
+        increment = PooledHead(size, pooled, name="increment")(features, train)
+        # Submodules keep their names: weights and their first random numbers go by them.
+        rotation_class = None
         if self.config.rotation_classifier.width:
             width = self.config.rotation_classifier.width
             narrow = HeadConfig((width, width, width), pooled.dropout, pool_first=True)
-            turn = PooledHead(NUM_CUBE_ROTATIONS, narrow, name="turn")(features, train)
+            rotation_class = PooledHead(NUM_CUBE_ROTATIONS, narrow, name="turn")(features, train)
         extent = PooledHead(6 * parts, pooled, name="size")(features, train)
         extent = extent.reshape(batch, parts, 6)
         return PartsOutput(
             increment=increment,
-            turn=turn,
+            rotation_class=rotation_class,
             segmentation=segmentation,
             heatmap=heatmap,
             offset=offset,
@@ -125,20 +129,26 @@ def _unanimous(points, joints):
     return jnp.ones(shape, points.dtype), joints[:, None, :, 3:] - points[:, :, None], axis
 
 
-def vote(points, heatmap, offset, direction):
-    """Joint pivot and direction as heatmap-weighted means of the points' votes.
+def vote(
+    points: Float[Array, "B N 3"],
+    heatmap: Float[Array, "B N J"],
+    offset: Float[Array, "B N J 3"],
+    direction: Float[Array, "B N J 3"],
+) -> tuple[Float[Array, "B J 3"], Float[Array, "B J 3"]]:
+    """Joint direction and pivot as heatmap-weighted means of the points' votes (Eqs 6 and 7).
 
     The weights are divided by their sum: with the 1/N of the printed equations the pivot shrinks
     towards the origin (errata). The pivot is a point on the axis; where along it is arbitrary.
 
     Args:
-      points: [B, N, 3].
-      heatmap: [B, N, J] >= 0.
-      offset: [B, N, J, 3] from each point to its foot on the axis.
-      direction: [B, N, J, 3].
+      points: the cloud.
+      heatmap: weights, at least 0.
+      offset: from each point to its foot on the axis.
+      direction: of the axis, as each point sees it.
 
     Returns:
-      axis [B, J, 3] unit vectors and pivot [B, J, 3].
+      axis: unit vectors.
+      pivot: points on the axes.
     """
     weight = heatmap + 1e-9  # where no point has any, all have the same
     share = weight / weight.sum(axis=1, keepdims=True)
@@ -147,8 +157,10 @@ def vote(points, heatmap, offset, direction):
     return unit_vectors(axis), pivot
 
 
-def increment_transform(numbers, kind: IncrementKind) -> jax.Array:
-    """The rigid transform [..., 4, 4] that a network's output stands for.
+def increment_transform(
+    numbers: Float[Array, "*batch D"], kind: IncrementKind
+) -> Float[Array, "*batch 4 4"]:
+    """The rigid transform that a network's output stands for (Sec 5.3.2 and Table 9).
 
     Args:
       numbers: "lie": [..., 6] a twist (w, rho), mapped by the exponential (Eq 14); "euclidean":
@@ -164,8 +176,10 @@ def increment_transform(numbers, kind: IncrementKind) -> jax.Array:
     return se3.from_rt(rotation, numbers[..., 6:])
 
 
-def increment_numbers(transform, kind: IncrementKind) -> jax.Array:
-    """What a network should put out for a transform [..., 4, 4]; inverts the above."""
+def increment_numbers(
+    transform: Float[Array, "*batch 4 4"], kind: IncrementKind
+) -> Float[Array, "*batch D"]:
+    """The numbers that stand for a transform; inverts ``increment_transform``."""
     if kind == "lie":
         return se3.log(transform)
     axes = transform[..., :3, :2] - jnp.eye(3, dtype=transform.dtype)[:, :2]

@@ -8,6 +8,7 @@ import flax.linen as nn
 import flax.struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from caper_jax.config import NetworkConfig
 from caper_jax.models.encoders import encode
@@ -19,14 +20,14 @@ class RootOutput:
     """Stage I, in the frame and units of its input cloud.
 
     Attributes:
-      directions: [B, 2, 3] unit vectors, two axes of the root's frame.
-      confidence: [B, 2] in (0, 1); the correction factors of Eq 3.
-      translation: [B, 3].
+      directions: unit vectors, two axes of the root's frame.
+      confidence: in (0, 1); the correction factors of Eq 3.
+      translation: of the root's origin.
     """
 
-    directions: Any
-    confidence: Any
-    translation: Any
+    directions: Float[Array, "B 2 3"]
+    confidence: Float[Array, "B 2"]
+    translation: Float[Array, "B 3"]
 
 
 class RootNetwork(nn.Module):
@@ -35,8 +36,8 @@ class RootNetwork(nn.Module):
     config: NetworkConfig
 
     @nn.compact
-    def __call__(self, points, train: bool, space: Any = None) -> RootOutput:
-        """points [B, N, 3], network units -> RootOutput; see ``shared_neighborhoods``."""
+    def __call__(self, points: Float[Array, "B N 3"], train: bool, space: Any = None) -> RootOutput:
+        """Points in network units -> RootOutput; for ``space`` see ``shared_neighborhoods``."""
         mean = points.mean(axis=1, keepdims=True)
         features = encode(self.config, points - mean, train, space)
         heads = self.config.root_heads
@@ -58,8 +59,8 @@ class RootNetwork(nn.Module):
         return RootOutput(directions, confidence, residual + mean[:, 0])
 
 
-def quaternion_axes(numbers):
-    """Two axes at right angles, [B, 2, 3], from [B, 4]: a quaternion less the identity's."""
+def quaternion_axes(numbers: Float[Array, "B 4"]) -> Float[Array, "B 2 3"]:
+    """Two axes at right angles, from a quaternion less the identity's."""
     w, x, y, z = jnp.moveaxis(unit_vectors(numbers + jnp.array([1.0, 0, 0, 0])), -1, 0)
     first = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
     second = jnp.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1)

@@ -126,9 +126,9 @@ class Objective:
         metrics["segmentation_accuracy"] = (found * known).sum() / jnp.maximum(known.sum(), 1.0)
         if self.network.rotation_classifier.width:
             parts_losses = {name: value * right for name, value in parts_losses.items()}
-            parts_losses["rotation_class"] = losses.rotation_class_loss(parts.turn, turn)
+            parts_losses["rotation_class"] = losses.rotation_class_loss(parts.rotation_class, turn)
             metrics["rotation_class"] = parts_losses["rotation_class"].mean()
-            metrics["rotation_class_accuracy"] = (parts.turn.argmax(-1) == turn).mean()
+            metrics["rotation_class_accuracy"] = (parts.rotation_class.argmax(-1) == turn).mean()
             reference = rotate_pose(reference, jnp.asarray(CUBE_ROTATIONS)[turn])
         increment_loss, off = self._increment_loss(parts.increment, reference, truth)
         parts_losses["twist"] = increment_loss

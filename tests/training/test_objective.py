@@ -70,7 +70,7 @@ class Oracle(Objective):
                 view @ pose.rotation[:, 0],
                 unit * (view * pose.translation[:, 0, None, :]).sum(-1),
             ),
-            turn=None,
+            rotation_class=None,
             segmentation=100.0 * jax.nn.one_hot(labels[:, ::stride], category.num_parts),
             heatmap=jnp.where(voting, jnp.exp(-distance), 0.0),
             offset=offset,

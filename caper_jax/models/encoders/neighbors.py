@@ -7,10 +7,13 @@ scatters once; plain automatic differentiation costs some thirty times the forwa
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float, Int, Shaped
 
 BLOCK_ABOVE = 4096  # points, beyond which distances are not held all at once
 _BLOCK = 512  # queries whose distances are
@@ -18,12 +21,12 @@ _FEW = 128  # columns, up to which top_k is as fast
 _GROUPS = 32  # at least; more of them for rows longer than its square
 
 
-def squared_distances(a, b):
-    """[B, N, C], [B, M, C] -> [B, N, M] squared distances."""
+def squared_distances(a: Float[Array, "B N C"], b: Float[Array, "B M C"]) -> Float[Array, "B N M"]:
+    """Squared distances of all pairs."""
     if a.shape[-1] == 3:
         # One coordinate at a time: exact, and ten times as fast on a CPU as a sum over an axis of
         # three.
-        total = 0.0
+        total: Any = 0.0
         for axis in range(3):
             difference = a[:, :, None, axis] - b[:, None, :, axis]
             total += difference * difference
@@ -33,8 +36,10 @@ def squared_distances(a, b):
     return jnp.maximum(norms - 2.0 * cross, 0.0)
 
 
-def nearest(query, points, k: int, exclude_self: bool = False):
-    """Indices [B, N, k] of the k nearest of ``points`` [B, M, C] to each ``query`` [B, N, C].
+def nearest(
+    query: Float[Array, "B N C"], points: Float[Array, "B M C"], k: int, exclude_self: bool = False
+) -> Int[Array, "B N k"]:
+    """Indices of the k nearest of ``points`` to each ``query``.
 
     No gradient passes through the choice. With ``exclude_self`` query and points are the same
     array and no point is its own neighbor.
@@ -50,8 +55,8 @@ def nearest(query, points, k: int, exclude_self: bool = False):
     return _by_distance(choose, query, points)
 
 
-def nearest_row(query, points):
-    """Index [B, N] of the nearest of ``points`` [B, M, C] to each ``query`` [B, N, C]."""
+def nearest_row(query: Float[Array, "B N C"], points: Float[Array, "B M C"]) -> Int[Array, "B N"]:
+    """Index of the nearest of ``points`` to each ``query``."""
     return _by_distance(lambda distance, _: first_smallest(distance), query, points)
 
 
@@ -77,8 +82,8 @@ def _by_distance(choose, query, points):
     return chosen.reshape(batch, blocks * _BLOCK, *chosen.shape[3:])[:, :count]
 
 
-def smallest_k(values, k: int):
-    """Columns [B, N, k] (int32) of the k smallest of values [B, N, M], in order.
+def smallest_k(values: Float[Array, "B N M"], k: int) -> Int[Array, "B N k"]:
+    """Columns (int32) of the k smallest of each row, in order.
 
     Equal ones come by column; inf counts as absent while enough others are left. The same as
     ``lax.top_k(-values, k)[1]``, in a third of its time on a CPU.
@@ -99,7 +104,7 @@ def smallest_k(values, k: int):
     return lax.optimization_barrier(chosen)
 
 
-def first_smallest(values, axis: int = -1):
+def first_smallest(values: Shaped[Array, "..."], axis: int = -1) -> Int[Array, "..."]:
     """As ``values.argmin(axis)``: two plain minima, which a CPU takes several at a time.
 
     Where values are NaN the index is any valid one.
@@ -149,8 +154,8 @@ def _by_groups(values, k: int):
     return chosen.T.reshape(batch, count, k)
 
 
-def smallest(squared):
-    """Index [...] of the smallest of squared distances [..., M]; no gradient passes.
+def smallest(squared: Float[Array, "*batch M"]) -> Int[Array, "*batch"]:
+    """Index of the smallest of squared distances; no gradient passes.
 
     Float32 ones are compared as integers that carry the index in their lowest bits: a minimum is
     three times as fast as an argmin on a CPU. Distances that agree to 2^-13 may change places.
@@ -165,13 +170,17 @@ def smallest(squared):
     return (packed | jnp.arange(size, dtype=jnp.int32)).min(-1) & mask
 
 
-def gather(features, index):
-    """features [B, M, ...], index [B, ...] -> [B, ..., C] rows, per batch element."""
+def gather(
+    features: Shaped[Array, "B M *row"], index: Int[Array, "B *at"]
+) -> Shaped[Array, "B *at *row"]:
+    """Rows of each batch element at its indices."""
     return jax.vmap(lambda rows, at: rows.at[at].get(mode="promise_in_bounds"))(features, index)
 
 
-def directions(points, index):
-    """Unit vectors [B, N, k, 3] from each point [B, N, 3] to its neighbors; zero if they meet."""
+def directions(
+    points: Float[Array, "B N 3"], index: Int[Array, "B N k"]
+) -> Float[Array, "B N k 3"]:
+    """Unit vectors from each point to its neighbors; zero if they meet."""
     offset = gather(points, index) - points[:, :, None, :]
     squared = (offset * offset).sum(-1, keepdims=True)
     apart = squared > 1e-24
@@ -208,17 +217,19 @@ def _winners(direction, index, features, weights):
 
 
 @jax.custom_vjp
-def directional_max(direction, index, features, weights):
+def directional_max(
+    direction: Float[Array, "B N k 3"],
+    index: Int[Array, "B N k"],
+    features: Float[Array, "B M C"] | None,
+    weights: Float[Array, "3 C"],
+) -> Float[Array, "B N C"]:
     """max over neighbors j of relu(d_j . W) * f_j: the core of the HS layer (3D-GCN kernel).
 
     Args:
-      direction: [B, N, k, 3] unit vectors to the neighbors.
-      index: [B, N, k] their rows in ``features``; k at most 256.
-      features: [B, M, C] supports, or None for the surface layer (f_j = 1).
-      weights: [3, C] unit support directions.
-
-    Returns:
-      [B, N, C].
+      direction: unit vectors to the neighbors.
+      index: their rows in ``features``; k at most 256.
+      features: supports, or None for the surface layer (f_j = 1).
+      weights: unit support directions.
     """
     return _winners(direction, index, features, weights)[0]
 
@@ -279,8 +290,10 @@ directional_max.defvjp(_directional_max_forward, _directional_max_backward)
 
 
 @jax.custom_vjp
-def neighbor_max(features, index):
-    """max over neighbors: features [B, M, C], index [B, N, k] -> [B, N, C]."""
+def neighbor_max(
+    features: Float[Array, "B M C"], index: Int[Array, "B N k"]
+) -> Float[Array, "B N C"]:
+    """max over neighbors j of f_j."""
     return _neighbor_winners(features, index)[0]
 
 
