@@ -10,17 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.lie import se3, so3
 from caper_jax.lie.linalg import as_floating, cross, unit
 
 
-def revolute_transform(axis: ArrayLike, pivot: ArrayLike, angle: ArrayLike) -> jax.Array:
+def revolute_transform(
+    axis: ArrayLike, pivot: ArrayLike, angle: ArrayLike
+) -> Float[Array, "... 4 4"]:
     """Turn [..., 4, 4] about the line through ``pivot``.
 
     R is Rodrigues' rotation about the unit axis u, ``cos I + (1 - cos) u u^T + sin hat(u)``.
@@ -33,7 +35,7 @@ def revolute_transform(axis: ArrayLike, pivot: ArrayLike, angle: ArrayLike) -> j
     return joint_transform("revolute", axis, pivot, angle)
 
 
-def prismatic_transform(axis: ArrayLike, displacement: ArrayLike) -> jax.Array:
+def prismatic_transform(axis: ArrayLike, displacement: ArrayLike) -> Float[Array, "... 4 4"]:
     """Slide [..., 4, 4] along an axis: ``[I | d u]``.
 
     Args:
@@ -47,7 +49,7 @@ def prismatic_transform(axis: ArrayLike, displacement: ArrayLike) -> jax.Array:
 
 def joint_transform(
     joint_type: str, axis: ArrayLike, pivot: ArrayLike, state: ArrayLike
-) -> jax.Array:
+) -> Float[Array, "... 4 4"]:
     """Transform [..., 4, 4] of a joint at a state.
 
     Args:
@@ -67,7 +69,7 @@ def joint_transform(
 
 def joint_transforms(
     joint_types: Sequence[str], axis: ArrayLike, pivot: ArrayLike, state: ArrayLike
-) -> jax.Array:
+) -> Float[Array, "... J 4 4"]:
     """Transforms [..., J, 4, 4] of J joints, each at its own state.
 
     Args:
@@ -106,7 +108,7 @@ def forward_kinematics(
     state: ArrayLike,
     joint_types: Sequence[str],
     parents: Sequence[int],
-) -> jax.Array:
+) -> Float[Array, "... K 4 4"]:
     """Poses of all K = J + 1 parts: ``T_k = T_parent(k) J_k(state_k)``.
 
     Axes and pivots are given in the root's canonical frame at rest. At rest every part shares the

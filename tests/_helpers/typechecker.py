@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
+from operator import or_
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
@@ -41,4 +43,6 @@ def _of_any_kind(hint: Any) -> Any:
     if not arguments or not _says_a_shape(hint):
         return hint
     arguments = tuple(map(_of_any_kind, arguments))
-    return Union[arguments] if origin in (Union, UnionType) else origin[arguments]
+    if origin in (Union, UnionType):
+        return reduce(or_, arguments)
+    return origin[arguments]
