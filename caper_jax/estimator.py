@@ -254,7 +254,7 @@ def load(
         one that ships with the package.
       object_scale: how many times as large the objects are as those the model was trained on; the
         shipped models know real sizes, PartNet's objects in PM-Videos and ArtImage are larger.
-      camera_roll: degrees by which things that stand upright are turned clockwise in the image, 180
+      camera_roll: degrees by which upright things appear rotated clockwise in the image, 180
         for a camera upside down; the shipped models know level cameras, within 15 deg.
 
     Raises:

@@ -119,6 +119,9 @@ def test_the_manifest_says_what_goes_in_and_comes_out(drawer):
         assert (entry["shape"], entry["dtype"]) == (list(value.shape), value.dtype.name), name
         assert entry["meaning"].count(",", 0, entry["meaning"].index("]")) == value.ndim - 1, name
     assert manifest["outputs"]["joint_state"]["unit"] == ["meters"] * 3
+    frames = {name: entry["frame"] for name, entry in manifest["outputs"].items()}
+    assert set(frames.values()) - {""} == set(manifest["frames"])
+    assert (frames["joint_axis"], frames["joint_axis_camera"]) == ("root_rest", "camera")
     assert [part["name"] for part in manifest["parts"]] == list(estimator.category.parts)
     assert [(j["parent"], j["child"], j["type"]) for j in manifest["joints"]] == [
         ("body", f"drawer{i}", "prismatic") for i in (1, 2, 3)

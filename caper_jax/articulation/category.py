@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from caper_jax.errors import CaperError, unknown_name
 from caper_jax.geometry.solids import Solid
 
 JointType = Literal["revolute", "prismatic"]
@@ -75,7 +76,7 @@ class Viewpoint:
       azimuth: degrees, full circle by default; 0 looks at the front (+z).
       elevation: degrees above the table.
       roll: degrees, either side of ``camera_roll``.
-      camera_roll: degrees by which things that stand upright are turned clockwise in the image.
+      camera_roll: degrees by which upright things appear rotated clockwise in the image.
       distance: in object diagonals.
       either_side: the object lies on its one side as often as on the other, so that cameras above
         the table look at either.
@@ -152,8 +153,6 @@ class Category:
         Raises:
           CaperError: a factor that is not positive.
         """
-        from caper_jax.errors import CaperError
-
         if not 0 < factor < np.inf:
             raise CaperError(f"object scale must be positive, got {factor}")
         if factor == 1.0:
@@ -181,14 +180,12 @@ class Category:
         """The category as cameras see it that are not level; same networks, same weights.
 
         Args:
-          degrees: by which things are turned clockwise in the image, beyond what they were; 180
+          degrees: by which things appear rotated clockwise in the image, on top of before; 180
             for a camera upside down.
 
         Raises:
           CaperError: an angle that is not finite.
         """
-        from caper_jax.errors import CaperError
-
         if not np.isfinite(degrees):
             raise CaperError(f"camera roll must be finite, in degrees, got {degrees}")
         if degrees == 0.0:
@@ -197,8 +194,6 @@ class Category:
         return replace(self, viewpoint=replace(self.viewpoint, camera_roll=camera_roll))
 
     def __post_init__(self) -> None:
-        from caper_jax.errors import CaperError, unknown_name
-
         where = f"category {self.name!r}"
         if len(self.parts) != len(self.joints) + 1:
             raise CaperError(f"{where}: {len(self.parts)} parts need {len(self.parts) - 1} joints")

@@ -45,9 +45,9 @@ def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
     return x / length, y / length, z / length
 
 
-def turned(solid: Solid, rotation: np.ndarray, pivot=(0.0, 0.0, 0.0)) -> Solid:
-    """The solid (and its hole) turned by ``rotation`` [3, 3] about ``pivot`` [3]."""
-    hole = None if solid.hole is None else turned(solid.hole, rotation, pivot)
+def rotated(solid: Solid, rotation: np.ndarray, pivot=(0.0, 0.0, 0.0)) -> Solid:
+    """The solid (and its hole) rotated by ``rotation`` [3, 3] about ``pivot`` [3]."""
+    hole = None if solid.hole is None else rotated(solid.hole, rotation, pivot)
     center = rotation @ (solid.center - pivot) + pivot
     return replace(solid, center=center, rotation=rotation @ solid.rotation, hole=hole)
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry, Viewpoint
-from caper_jax.categories.forms import about, beam, chain, mirrored, turned
+from caper_jax.categories.forms import about, beam, chain, mirrored, rotated
 from caper_jax.geometry.solids import Solid, box, cylinder
 
 _Y = np.array([0.0, 1.0, 0.0])
@@ -145,7 +145,7 @@ def _handle(half: _Half) -> list[Solid]:
         end = middle[np.argmin(middle[:, 0])]
         out = np.array([-0.9 * half.rest, 0.0, -0.45 * half.rest])
         solids.append(beam(end, end + out, half.tube, _Y, round_=True))
-    return [turned(solid, about("y", half.bend)) for solid in solids]
+    return [rotated(solid, about("y", half.bend)) for solid in solids]
 
 
 def _office(rng: np.random.Generator) -> tuple[_Half, _Half]:
@@ -314,9 +314,9 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     root_half, other_half = kind(rng)
     other_half = replace(other_half, bend=-other_half.bend)  # the same way, after the half turn
     root = _blade(root_half) + _handle(root_half)
-    other = [turned(solid, _HALF_TURN) for solid in _blade(other_half) + _handle(other_half)]
+    other = [rotated(solid, _HALF_TURN) for solid in _blade(other_half) + _handle(other_half)]
     parts = [
-        [turned(solid, about("y", angle)) for solid in solids]
+        [rotated(solid, about("y", angle)) for solid in solids]
         for solids, angle in ((root, -_REST / 2), (other, _REST / 2))
     ]
     if rng.random() < 0.1:

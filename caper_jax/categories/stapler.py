@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
-from caper_jax.categories.forms import about, beam, turned
+from caper_jax.categories.forms import about, beam, rotated
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid
 
 # Positive opens: the arm, in front of the hinge (+z), swings up (+y), which is about -x.
@@ -239,7 +239,7 @@ def _arm(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
     arm = [box(place, (inner, plan.magazine / 2, (front - start) / 2))]
     tilt = np.radians(rng.uniform(0.5, 7)) if rng.random() < 0.5 and name != "long" else 0.0
     cover = _cover(rng, plan)
-    arm += [turned(solid, about("x", -tilt), (0.0, plan.hinge, 0.0)) for solid in cover]
+    arm += [rotated(solid, about("x", -tilt), (0.0, plan.hinge, 0.0)) for solid in cover]
     if rng.random() < 0.5:  # the plate at the nose behind which the staples are driven down
         rise = (plan.magazine + plan.cover * rng.uniform(0.1, 0.4)) / 2
         arm.append(box((0, plan.under + rise, front), (inner * 0.9, rise, plan.scale * 0.0008)))

@@ -64,7 +64,7 @@ def from_entries(parts: Sequence[jax.Array]) -> jax.Array:
     """Vectors [..., D] of D entries [...]; inverts ``entries``.
 
     Choices compile to one loop that evaluates what the entries share once; XLA on a CPU evaluates
-    it anew for each operand of a concatenation, and all that this in turn shares.
+    it again for each operand of a concatenation, and all that this in turn shares.
     """
     index = np.arange(len(parts))
     result = parts[0][..., None]
@@ -89,7 +89,7 @@ def from_rows(parts: Sequence[Sequence[jax.Array]]) -> jax.Array:
 @from_rows.defjvp
 def _from_rows_jvp(primals, tangents):
     # The reverse of one concatenation cancels that of rows. XLA computes the operands of more than
-    # eight apart, so that nothing they share is evaluated anew.
+    # eight apart, so that nothing they share is evaluated twice.
     (parts,), (changes,) = primals, tangents
     flat = jnp.stack([entry for row in changes for entry in row], axis=-1)
     return from_rows(parts), flat.reshape(*flat.shape[:-1], len(parts), len(parts[0]))
