@@ -142,8 +142,8 @@ def estimate_record(
 
     record = pose_record(name, prediction.pose, category)
     for k, part in enumerate(record["parts"]):
-        part["points"] = int(prediction.seen[k])
-        part["hidden"] = bool(prediction.seen[k] < HIDDEN_POINTS)
+        part["points"] = int(prediction.points_per_part[k])
+        part["hidden"] = bool(prediction.points_per_part[k] < HIDDEN_POINTS)
         if prediction.rotation_std is not None:
             part["rotation_std_deg"] = float(np.degrees(prediction.rotation_std[k]))
             part["translation_std"] = float(prediction.translation_std[k])
@@ -173,7 +173,7 @@ def frame_record(
         **pose_record(name, result.pose, category),
         "energy": round(float(result.energy), 7),
         "keyframe": bool(result.keyframe),
-        "estimated": bool(result.estimated),
+        "estimated": bool(result.estimator_queried),
         "lost": bool(result.lost),
         "milliseconds": round(1000 * seconds, 3),
     }

@@ -105,7 +105,7 @@ def track_video(
         else None,
         energy=stacked.energy,
         keyframe=stacked.keyframe,
-        estimated=stacked.estimated,
+        estimated=stacked.estimator_queried,
         lost=stacked.lost,
         seconds=np.array(seconds),
     )
@@ -180,7 +180,7 @@ def track_records(track: Track, category: Category) -> Iterator[dict[str, Any]]:
             labels=None,
             energy=track.energy[index],
             keyframe=track.keyframe[index],
-            estimated=track.estimated[index],
+            estimator_queried=track.estimated[index],
             lost=track.lost[index],
         )
         yield frame_record(frame, result, category, float(track.seconds[index]))

@@ -220,7 +220,7 @@ def test_an_equivalent_pose_is_the_same_object(category, pose, symmetry):
 
 def alike(size):
     """Extents [F, 3] of the box's other part with which both may change places."""
-    return size @ np.abs(np.array(BOX.symmetries[0].turn))
+    return size @ np.abs(np.array(BOX.symmetries[0].rotation))
 
 
 def test_errors_up_to_symmetry_take_the_better_truth_of_each_frame():
