@@ -1,11 +1,9 @@
-"""The one exception type for mistakes a person can mend."""
+"""The one exception type for mistakes in what a user gave."""
 
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Iterable
-from typing import Any
 
 
 class CaperError(ValueError):
@@ -22,29 +20,3 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> CaperError:
     near = difflib.get_close_matches(name, names, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return CaperError(f"unknown {kind} {name!r}{hint} (known: {', '.join(names)})")
-
-
-def check_bounds(section: str, config: Any, **bounds: float) -> None:
-    """CaperError for a number of a configuration that is below its bound or not finite, or none.
-
-    Args:
-      section: where a configuration file has it, for the message.
-      config: holds the numbers as attributes; a tuple of numbers is held to the bound in each.
-      **bounds: the least value of each.
-    """
-    for name, low in bounds.items():
-        value = getattr(config, name)
-        numbers = value if isinstance(value, tuple) else (value,)
-        if not numbers:
-            raise CaperError(f"{section}.{name} must not be empty")
-        if not all(low <= number < math.inf for number in numbers):
-            kind = "finite and " if math.inf in numbers else ""
-            raise CaperError(f"{section}.{name} must be {kind}at least {low}, got {value}")
-
-
-def check_fractions(section: str, config: Any, names: Iterable[str]) -> None:
-    """CaperError for a number of a configuration, of these names, that is not in [0, 1]."""
-    for name in names:
-        value = getattr(config, name)
-        if not 0.0 <= value <= 1.0:
-            raise CaperError(f"{section}.{name} is a fraction from 0 to 1, got {value}")

@@ -56,12 +56,12 @@ class Tracker:
         self.state = self.initial_state()
 
     def initial_state(self) -> TrackerState:
-        """The state before a first frame, whose pose the static estimator will give."""
+        """The state before a first frame, whose pose the single-frame estimator will give."""
         category, network = self.estimator.category, self.estimator.network
         return initial_state(category, network, self.config)
 
     def reset(self, points=None, rotation=None, translation=None, labels=None) -> None:
-        """Forgets the video; optionally begins another one with a known pose.
+        """Forgets the video, and may begin another one with a known pose.
 
         Args:
           points: [N, 3] meters, the frame whose pose is known; None to let the estimator begin.
@@ -88,7 +88,7 @@ class Tracker:
         self.state = self._given(self.estimator.variables, frame, *pose)
 
     def observe(self, points, labels=None) -> Observation:
-        """A frame of any number of points as the step takes it.
+        """The observation that the step takes, from any number of points.
 
         Args:
           points: [N, 3] meters, camera frame, N may be 0; NaN, infinite and zero points and those

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import zipfile
 import zlib
@@ -11,6 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
 
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
@@ -140,11 +142,8 @@ def read_card(directory: str | Path) -> dict[str, Any]:
 
 
 def flatten(variables: PyTree) -> dict[str, Any]:
-    """Leaves of nested dicts by "a/b/c" path."""
-    return {
-        jax.tree_util.keystr(path, simple=True, separator="/"): leaf
-        for path, leaf in jax.tree_util.tree_flatten_with_path(variables)[0]
-    }
+    """Leaves of nested dicts by "a/b/c" path, sorted."""
+    return dict(sorted(flatten_dict(variables, sep="/").items()))
 
 
 def unflatten(flat: dict[str, Any], where: str = "variables") -> PyTree:
@@ -157,18 +156,14 @@ def unflatten(flat: dict[str, Any], where: str = "variables") -> PyTree:
     Raises:
       CaperError: a name is both a leaf and the parent of one.
     """
-    tree: dict[str, Any] = {}
-    for name, leaf in flat.items():
-        *parents, last = name.split("/")
-        node = tree
-        for parent in parents:
-            node = node.setdefault(parent, {})
-            if not isinstance(node, dict):
-                raise CaperError(f"{where}: {name!r} lies below another array")
-        if last in node:
-            raise CaperError(f"{where}: {name!r} is both an array and a group")
-        node[last] = leaf
-    return tree
+    for name in flat:
+        for parent in itertools.accumulate(name.split("/")[:-1], "{}/{}".format):
+            if parent in flat:
+                raise CaperError(
+                    f"{where}: {parent!r} is both an array and a group: "
+                    f"{name!r} lies below another array"
+                )
+    return unflatten_dict(flat, sep="/")
 
 
 def _compact(name: str, leaf: Any) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import reduce
+from functools import reduce, wraps
 from operator import or_
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
@@ -24,7 +24,20 @@ def check(function: Callable[..., Any]) -> Callable[..., Any]:
     if function.__name__ == "__init__" or not kept:
         return function
     function.__annotations__ = kept
-    return beartype(function)
+    checked = beartype(function)
+
+    @wraps(function)
+    def check_unless_symbolic(*args: Any, **kwargs: Any) -> Any:
+        given = (*args, *kwargs.values())
+        return (function if any(map(_is_symbolic, given)) else checked)(*args, **kwargs)
+
+    return check_unless_symbolic
+
+
+def _is_symbolic(value: Any) -> bool:
+    """Whether the shape is open, as in exports for batches of any size; jaxtyping knows none."""
+    shape = getattr(value, "shape", ())
+    return isinstance(shape, tuple) and not all(isinstance(size, int) for size in shape)
 
 
 def _is_array(hint: Any) -> bool:

@@ -75,28 +75,28 @@ def test_a_definition_counts_its_parts():
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes",
     [
-        ({"parts": ("a", "b")}, "2 parts need 1 joints"),
-        ({"joints": (Joint("revolute", 0, (0, 1)), Joint("revolute", 2, (0, 1)))}, "part 2 must"),
-        ({"joints": (Joint("revolute", -1, (0, 1)),) * 2}, "part 1 must come after its parent -1"),
-        ({"joints": (Joint("revolute", 0, (1.0, 1.0)),) * 2}, "part 1 must have finite limits"),
-        ({"joints": (Joint("revolute", 0, (0, np.inf)),) * 2}, "part 1 must have finite limits"),
-        ({"joints": (Joint("revolut", 0, (0, 1)),) * 2}, "'revolut'; did you mean 'revolute'"),
-        ({"directions": ("y", "w")}, "directions are two of x, y, z"),
-        ({"mean_size": ((1.0, 1.0, 0.0),) * 3}, "mean_size must be positive"),
-        ({"mean_center": ((0.0, 0.0, np.nan),) * 3}, "mean_center must be finite"),
-        ({"unit": -1.0}, "unit and mean_size must be positive"),
-        ({"closed": "shut"}, "closed is 'low', 'high' or None, got 'shut'"),
-        ({"symmetries": (Symmetry((0, 1), EYE, "why"),)}, "must permute the parts"),
-        ({"symmetries": (Symmetry((2, 1, 0), MIRROR, "why"),)}, "is not a rotation"),
-        ({"directions": ("y", "y")}, "two directions must differ"),
-        ({"mean_size": ((1.0, 1.0, 1.0),) * 2}, r"mean_size must be \[3, 3\]"),
-        ({"mean_center": ((0.0, 0.0),) * 3}, r"mean_center must be \[3, 3\]"),
+        {"parts": ("a", "b")},
+        {"joints": (Joint("revolute", 0, (0, 1)), Joint("revolute", 2, (0, 1)))},
+        {"joints": (Joint("revolute", -1, (0, 1)),) * 2},
+        {"joints": (Joint("revolute", 0, (1.0, 1.0)),) * 2},
+        {"joints": (Joint("revolute", 0, (0, np.inf)),) * 2},
+        {"joints": (Joint("revolut", 0, (0, 1)),) * 2},
+        {"directions": ("y", "w")},
+        {"directions": ("y", "y")},
+        {"mean_size": ((1.0, 1.0, 0.0),) * 3},
+        {"mean_size": ((1.0, 1.0, 1.0),) * 2},
+        {"mean_center": ((0.0, 0.0, np.nan),) * 3},
+        {"mean_center": ((0.0, 0.0),) * 3},
+        {"unit": -1.0},
+        {"closed": "shut"},
+        {"symmetries": (Symmetry((0, 1), EYE, "why"),)},
+        {"symmetries": (Symmetry((2, 1, 0), MIRROR, "why"),)},
     ],
 )
-def test_mistakes_in_a_definition_name_the_category(changes, message):
-    with pytest.raises(CaperError, match=f"category 'chain': .*{message}"):
+def test_mistakes_in_a_definition_name_the_category(changes):
+    with pytest.raises(CaperError, match="category 'chain'"):
         define(**changes)
 
 

@@ -353,63 +353,56 @@ def test_slopes_remember_the_states_between_frames_alone():
     assert 0 < size(jax.eval_shape(kept, *given)) < 2 * size(given)
 
 
+EYES, OFF = np.tile(np.eye(3), (2, 1, 1)), np.full((2, 3), 0.8)
+
+
 class TestMistakes:
     POINTS = plates(1)[0]
 
     @pytest.mark.parametrize(
-        ("points", "message"),
+        "points",
         [
-            (np.zeros((64, 4)), r"a cloud must be \[N, 3\], got \(64, 4\)"),
-            (np.zeros((1, 64, 3)), r"a cloud must be \[N, 3\], got \(1, 64, 3\)"),
-            ([["a"] * 3] * 20, "must be numbers in meters"),
-            ([[1, 2, 3], [1, 2]], "points is no array"),
-            (POINTS * 1000, "millimeters"),
-            (POINTS * [1, -1, -1], "behind the camera"),
+            np.zeros((64, 4)),
+            np.zeros((1, 64, 3)),
+            [["a"] * 3] * 20,
+            [[1, 2, 3], [1, 2]],
+            POINTS * 1000,  # millimeters
+            POINTS * [1, -1, -1],  # behind the camera
         ],
     )
-    def test_clouds(self, points, message):
-        with pytest.raises(CaperError, match=message):
+    def test_clouds(self, points):
+        with pytest.raises(CaperError):
             toy()(points)
 
-    def test_labels_of_another_length(self):
-        with pytest.raises(CaperError, match=r"labels must be \[64\] like points, got \(63,\)"):
-            toy()(self.POINTS, np.zeros(63, int))
-
-    @pytest.mark.parametrize("labels", [np.full(64, 2), np.full(64, -2), np.full(64, 0.7)])
+    @pytest.mark.parametrize(
+        "labels", [np.zeros(63, int), np.full(64, 2), np.full(64, -2), np.full(64, 0.7)]
+    )
     def test_labels_that_are_no_parts(self, labels):
-        with pytest.raises(CaperError, match="labels must be integers from -1 to 1"):
+        with pytest.raises(CaperError, match="labels"):
             toy()(self.POINTS, labels)
 
     @pytest.mark.parametrize(
-        ("factor", "shift", "message"),
+        ("rotation", "translation"),
         [
-            (2.0, 0.8, "must hold rotation matrices"),
-            (np.diag([1.0, 1.0, -1.0]), 0.8, "must hold rotation matrices"),
-            (np.nan, 0.8, "must hold rotation matrices"),
-            (1.0, np.nan, "must be meters"),
-            (1.0, 800.0, "must be meters, at most 50, got 800"),
-            ("x", 0.8, "must be numbers"),
+            (2.0 * EYES, OFF),
+            (np.diag([1.0, 1.0, -1.0]) * EYES, OFF),
+            (np.nan * EYES, OFF),
+            (EYES, np.nan * OFF),
+            (EYES, 1000 * OFF),
+            ("x", OFF),
+            (EYES[0], OFF),
+            (EYES, OFF[0]),
         ],
     )
-    def test_first_poses_that_are_no_motions_leave_the_track_as_it_was(
-        self, factor, shift, message
-    ):
+    def test_first_poses_that_are_no_motions_leave_the_track_as_it_was(self, rotation, translation):
         tracker = toy()
         before = tracker.state
-        rotation = "x" if isinstance(factor, str) else np.tile(np.eye(3), (2, 1, 1)) * factor
-        with pytest.raises(CaperError, match=message):
-            tracker.reset(self.POINTS, rotation, np.full((2, 3), shift))
-        with pytest.raises(CaperError, match="needs the points of its frame"):
+        with pytest.raises(CaperError):
+            tracker.reset(self.POINTS, rotation, translation)
+        with pytest.raises(CaperError, match="points"):
             tracker.reset(rotation=rotation)
         assert tracker.state is before
 
-    @pytest.mark.parametrize(
-        ("rotation", "translation"), [((3, 3), (2, 3)), ((2, 3, 3), (3,)), ((3, 3, 3), (3, 3))]
-    )
-    def test_first_poses_of_other_shapes(self, rotation, translation):
-        with pytest.raises(CaperError, match=r"must be rotation \[2, 3, 3\] and translation"):
-            toy().reset(self.POINTS, np.zeros(rotation), np.zeros(translation))
-
     def test_a_first_frame_without_the_object(self):
-        with pytest.raises(CaperError, match="too few points to begin with; at least 16"):
-            toy().reset(self.POINTS[:15], np.zeros((2, 3, 3)), np.zeros((2, 3)))
+        with pytest.raises(CaperError, match="16"):
+            toy().reset(self.POINTS[:15], EYES, OFF)

@@ -19,6 +19,7 @@ from collections.abc import Callable
 from typing import Any
 
 import flax.linen as nn
+from jaxtyping import Array, Float
 
 from caper_jax.config import NetworkConfig
 from caper_jax.errors import CaperError, unknown_name
@@ -42,7 +43,8 @@ def register(name: str, module: Callable[..., nn.Module]) -> None:
     Raises:
       CaperError: another encoder, or a setting of ``NetworkConfig``, already has that name.
     """
-    if ENCODERS.get(name, module) is not module or hasattr(NetworkConfig, name):
+    taken = name in ENCODERS or hasattr(NetworkConfig, name)
+    if taken and ENCODERS.get(name) is not module:
         raise CaperError(f"the name {name!r} of an encoder is taken; choose another one")
     ENCODERS[name] = module
 
@@ -60,12 +62,12 @@ def make_encoder(config: NetworkConfig) -> Any:
     return module(name="encoder") if sizes is None else module(sizes, name="encoder")
 
 
-def shared_neighborhoods(config: NetworkConfig, points) -> Any:
+def shared_neighborhoods(config: NetworkConfig, points: Float[Array, "B N 3"]) -> Any:
     """What both stages may use in evaluation: neighbors do not change with the pose.
 
     Args:
       config: sizes.
-      points: [B, N, 3] the cloud, in any pose, network units.
+      points: the cloud, in any pose, network units.
 
     Returns:
       None for an encoder that searches no neighbors.
@@ -74,8 +76,10 @@ def shared_neighborhoods(config: NetworkConfig, points) -> Any:
     return None if search is None else search(points - points.mean(axis=1, keepdims=True))
 
 
-def encode(config: NetworkConfig, points, train: bool, space: Any = None) -> Features:
-    """Features of points [B, N, 3]; ``space`` is what ``shared_neighborhoods`` gave."""
+def encode(
+    config: NetworkConfig, points: Float[Array, "B N 3"], train: bool, space: Any = None
+) -> Features:
+    """Features of a cloud; ``space`` is what ``shared_neighborhoods`` gave."""
     encoder = make_encoder(config)
     features: Features = encoder(points, train, *(() if space is None else (space,)))
     return features
