@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from caper_jax.articulation.urdf_rule import UrdfRule
 from caper_jax.geometry.solids import Solid
 
 JointType = Literal["revolute", "prismatic"]
@@ -107,6 +108,9 @@ class Category:
       viewpoint: cameras of generated frames.
       symmetries: declared ambiguities.
       closed: the limit at which a joint is closed; None where that means nothing.
+      urdf_rule: how objects in URDF files become this category's; no rule takes the file's state 0
+        as the rest pose, z as up and x as the front.
+      artimage_id: its number in ArtImage's annotations, 0 where it has none.
     """
 
     name: str
@@ -121,6 +125,9 @@ class Category:
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
     symmetries: tuple[Symmetry, ...] = ()
     closed: Literal["low", "high"] | None = "low"
+    # Compiled functions do not depend on it: it is no part of equality or of the hash.
+    urdf_rule: UrdfRule = field(default_factory=UrdfRule, compare=False)
+    artimage_id: int = 0
 
     @property
     def num_parts(self) -> int:

@@ -1,4 +1,4 @@
-"""Forward kinematics of a part tree."""
+"""Forward kinematics of a part tree: differentiable in JAX, and in float64 on the host."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from caper_jax.articulation.joints import joint_transforms
-from caper_jax.errors import CaperError
+from caper_jax.errors import CaperError, unknown_name
 from caper_jax.lie import se3
 from caper_jax.lie.linalg import as_floating
 
@@ -56,3 +57,68 @@ def forward_kinematics(
     for joint, parent in enumerate(parents):
         poses.append(se3.compose(poses[parent], motions[..., joint, :, :]))
     return jnp.stack(jnp.broadcast_arrays(*poses), axis=-3)
+
+
+def joint_transform_float64(
+    joint_type: str, axis: np.ndarray, pivot: np.ndarray, state: float
+) -> np.ndarray:
+    """``joints.joint_transform`` of one joint with a unit axis, in float64 without JAX.
+
+    For files, whose meshes must not move by the rounding of float32.
+
+    Args:
+      joint_type: "revolute" or "prismatic".
+      axis: [3] unit vector.
+      pivot: [3] meters; without effect on a prismatic joint.
+      state: radians or meters.
+
+    Returns:
+      [4, 4].
+
+    Raises:
+      CaperError: unknown joint type.
+    """
+    from scipy.spatial.transform import Rotation  # importing it costs 0.1 s
+
+    motion = np.eye(4)
+    if joint_type == "prismatic":
+        motion[:3, 3] = state * axis
+    elif joint_type == "revolute":
+        motion[:3, :3] = Rotation.from_rotvec(state * axis).as_matrix()
+        motion[:3, 3] = pivot - motion[:3, :3] @ pivot
+    else:
+        raise unknown_name("joint type", joint_type, ("revolute", "prismatic"))
+    return motion
+
+
+def forward_kinematics_float64(
+    root: np.ndarray,
+    axis: np.ndarray,
+    pivot: np.ndarray,
+    state: Sequence[float] | np.ndarray,
+    joint_types: Sequence[str],
+    parents: Sequence[int],
+) -> np.ndarray:
+    """``forward_kinematics`` of one object with unit axes, in float64 without JAX.
+
+    Args:
+      root: [4, 4] pose of part 0.
+      axis: [J, 3] unit joint axes.
+      pivot: [J, 3] meters.
+      state: [J] radians or meters from the rest pose.
+      joint_types: J times "revolute" or "prismatic".
+      parents: J parent parts; a parent comes before its child.
+
+    Returns:
+      [K, 4, 4].
+
+    Raises:
+      CaperError: unknown joint type.
+    """
+    poses = [np.asarray(root, np.float64)]
+    for joint, parent in enumerate(parents):
+        motion = joint_transform_float64(
+            joint_types[joint], axis[joint], pivot[joint], state[joint]
+        )
+        poses.append(poses[parent] @ motion)
+    return np.stack(poses)

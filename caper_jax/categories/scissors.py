@@ -20,6 +20,7 @@ import numpy as np
 from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry, Viewpoint
 from caper_jax.categories.forms import about, mirrored, turned
 from caper_jax.categories.scissors_half import Half, blade_solids, handle_solids
+from caper_jax.categories.scissors_urdf import URDF_RULE
 
 _Y = np.array([0.0, 1.0, 0.0])
 _HALF_TURN = np.diag([1.0, -1.0, -1.0])
@@ -229,4 +230,6 @@ SCISSORS = Category(
             tolerance=0.05,
         ),
     ),
+    urdf_rule=URDF_RULE,
+    artimage_id=5,
 )

@@ -70,6 +70,22 @@ def corners(
     return apply(rotation[..., None, :, :], local) + translation[..., None, :]
 
 
+def rest_diagonal(size, center):
+    """Diagonal [...] of the axis-aligned box around all parts of an object at rest.
+
+    Args:
+      size: [..., K, 3] full extents of the parts' boxes, any unit.
+      center: [..., K, 3] their centers, same unit.
+
+    Returns:
+      [...], a numpy array where both are, in their own precision.
+    """
+    numpy = isinstance(size, np.ndarray) and isinstance(center, np.ndarray)
+    low = (center - size / 2).min(-2)
+    high = (center + size / 2).max(-2)
+    return (np if numpy else jnp).linalg.norm(high - low, axis=-1)
+
+
 def iou_size(size_a: ArrayLike, size_b: ArrayLike) -> jax.Array:
     """Intersection over union [...] of two boxes of sizes [..., 3] with common center and axes.
 

@@ -13,8 +13,7 @@ from caper_jax.data.readers import categories_in, open_dataset
 from caper_jax.data.types import Dataset
 from caper_jax.reproduce.options import SPLIT, Options
 from caper_jax.reproduce.videos import TEST_DATA, fingerprint, kept_file
-from caper_jax.synthetic.collect import collect_frames
-from caper_jax.synthetic.frames import Generator
+from caper_jax.synthetic.frames import Generator, collect_frames
 
 # As ``caper generate`` draws them: the evaluation picks from more points than the networks see.
 FRAME_DATA = replace(TEST_DATA, num_points=4096, measure_visibility=True)

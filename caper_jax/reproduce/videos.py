@@ -18,9 +18,8 @@ from caper_jax.data.readers import categories_in, open_dataset
 from caper_jax.data.types import Dataset, Frame
 from caper_jax.errors import CaperError
 from caper_jax.reproduce.options import SPLIT
-from caper_jax.synthetic.collect import collect_videos
 from caper_jax.synthetic.instances import InstanceBank
-from caper_jax.synthetic.videos import MODES, VideoGenerator
+from caper_jax.synthetic.videos import MODES, VideoGenerator, collect_videos
 
 # The paper's clouds have 1,024 points; its sensor noise is not stated.
 TEST_DATA = GeneratorConfig(instances=100, grid=128, num_points=1024, noise=("kinect",))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,19 +10,22 @@ from typing import Any, NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.config import GeneratorConfig
+from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.geometry.raster_order import grid_raster_order
+from caper_jax.progress import progress
 from caper_jax.synthetic import masks
 from caper_jax.synthetic import sensor as sensors
 from caper_jax.synthetic.camera import camera_pose, draw_camera
-from caper_jax.synthetic.instances import InstanceBank, build_bank, draw_instances
+from caper_jax.synthetic.instances import InstanceBank, build_bank, draw_instances, split_key
 from caper_jax.synthetic.ray_casting import FAR, nearest_part, part_depths, projected_bounds
-from caper_jax.synthetic.surroundings import add_clutter, spill_on_table, table_depth
 
+FRAMES_AT_A_TIME = 25  # what the frames of a seed are depends on it
 _MARGIN = 0.04  # of the object's projected box, on each side
 
 
@@ -47,7 +51,7 @@ class Batch:
     visibility: Any = None
 
 
-def systematic(key, hit, count: int):
+def systematic_sample(key, hit, count: int):
     """Raster indices [count] of hits [G, G], evenly spread in scan order; repeating if too few.
 
     The r-th pick is hit number floor((r + u) n / count): no sort, uniform over the image.
@@ -72,17 +76,10 @@ def draw_state_and_poses(key, instance: InstanceBank, category: Category):
     state_key, camera_key = jax.random.split(key)
     low, high = instance.limits[:, 0], instance.limits[:, 1]
     state = low + jax.random.uniform(state_key, low.shape) * (high - low)
-    diagonal = rest_diagonal(instance)
+    diagonal = rest_diagonal(instance.size, instance.box_center)
     view = category.viewpoint
     root = camera_pose(draw_camera(camera_key, view), view, diagonal)
     return state, part_poses(root, instance, state, category), diagonal
-
-
-def rest_diagonal(instance: InstanceBank):
-    """Diagonal of the whole object's box at rest, meters."""
-    low = (instance.box_center - instance.size / 2).min(0)
-    high = (instance.box_center + instance.size / 2).max(0)
-    return jnp.linalg.norm(high - low)
 
 
 def part_poses(root, instance: InstanceBank, state, category: Category):
@@ -165,12 +162,12 @@ def observe(
     seen = jnp.where(seen.any(), seen, hit)
 
     # Only the chosen pixels are measured: random numbers are what costs on a CPU.
-    index = systematic(keys.pick, seen, config.num_points)
+    index = systematic_sample(keys.pick, seen, config.num_points)
     chosen = jax.tree.map(lambda image: image.ravel()[index], surface)
     points = sensors.measure(keys.noise, sensor, chosen, (flat[0][index], flat[1][index]))
     labels = part.ravel()[index]
     if config.residue > 0:
-        diagonal = rest_diagonal(instance)
+        diagonal = rest_diagonal(instance.size, instance.box_center)
         points, labels = _add_residue(keys.residue, points, labels, diagonal, config.residue)
     if config.depth_scale > 0:
         error = jax.random.normal(jax.random.fold_in(keys.sensor, 1))
@@ -215,9 +212,9 @@ def _apply_mask(
     if config.occlusion > 0:
         hit = masks.occlude(key, hit, config.occlusion, config.occluders)
     if config.table > 0 or config.clutter > 0:
-        table = table_depth(instance, poses, category.viewpoint, rays)
+        table = masks.table_depth(instance, poses, category.viewpoint, rays)
     if config.table > 0:
-        depth, hit = spill_on_table(
+        depth, hit = masks.spill_on_table(
             jax.random.fold_in(key, 3), depth, part, hit, table, config.table, config.spill
         )
     if config.erosion > 0:
@@ -225,13 +222,13 @@ def _apply_mask(
         # A mask that takes in the table is not too tight.
         hit = jnp.where((hit & (part < 0)).any(), hit, eroded)
     if config.clutter > 0:
-        depth, part, hit = add_clutter(
+        depth, part, hit = masks.add_clutter(
             jax.random.fold_in(key, 4),
             depth,
             part,
             hit,
             table,
-            rest_diagonal(instance),
+            rest_diagonal(instance.size, instance.box_center),
             rays,
             config.clutter,
             config.spill,
@@ -292,3 +289,43 @@ class Generator:
           batch_size: B.
         """
         return self._batch(key, batch_size=batch_size, bank=self.bank)
+
+
+def collect(
+    draw: Callable[[Any, int], Batch], key: Any, total: int, size: int, title: str = "generating"
+) -> Batch:
+    """``total`` frames or videos as numpy arrays.
+
+    Args:
+      draw: (key, count) -> Batch, e.g. ``Generator.batch``.
+      key: PRNG key, into which the number of each draw's first frame is folded.
+      total: how many.
+      size: drawn at a time; the same key and size give the same frames.
+      title: of the progress display.
+    """
+    parts = []
+    with progress(title, total=total) as bar:
+        for start in range(0, total, size):
+            count = min(size, total - start)
+            batch = draw(jax.random.fold_in(key, start), size)
+            parts.append(jax.tree.map(lambda array, n=count: np.asarray(array)[:n], batch))
+            bar.update(count)
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
+
+
+def collect_frames(
+    generator: Generator, seed: int, frames: int, title: str = "generating"
+) -> dict[str, Any]:
+    """Single frames as the arguments of ``hdf5.write`` that they decide.
+
+    Args:
+      generator: draws them, of its split.
+      seed: of the split's key, see ``split_key``.
+      title: see ``collect``.
+      frames: how many.
+    """
+    key = split_key(generator.split, seed)
+    batch = collect(generator.batch, key, frames, FRAMES_AT_A_TIME, title)
+    prefix = f"{generator.category.name}_{generator.split}"
+    names = [f"{prefix}{instance:04d}_{index:06d}" for index, instance in enumerate(batch.instance)]
+    return {**vars(batch), "names": names}

@@ -16,9 +16,9 @@ import numpy as np
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.urdf.canonical import ImportedObject
-from caper_jax.data.urdf.meshes import NEEDS_MESH, Mesh
+from caper_jax.data.urdf import ImportedObject
 from caper_jax.errors import CaperError
+from caper_jax.geometry.meshes import NEEDS_MESH, Mesh
 from caper_jax.geometry.raster_order import grid_raster_order
 from caper_jax.synthetic import sensor as sensors
 from caper_jax.synthetic.frames import Batch, Keys, draw_state_and_poses
@@ -133,7 +133,7 @@ def render_frames(
     """
     category = objects[0].category
     mix = sensors.sensor_mix((noise,))
-    casters = [PartCaster(item.reference.parts) for item in objects]
+    casters = [PartCaster(item.at_rest.parts) for item in objects]
     instance = np.arange(frames) % len(objects)
     bank = _bank(objects)
     key = split_key(split, seed)
@@ -169,8 +169,8 @@ def _bank(objects: Sequence[ImportedObject]) -> InstanceBank:
 
     return InstanceBank(
         groups={},
-        joint_axis=stack([item.reference.axis for item in objects]),
-        joint_pivot=stack([item.reference.pivot for item in objects]),
+        joint_axis=stack([item.at_rest.axis for item in objects]),
+        joint_pivot=stack([item.at_rest.pivot for item in objects]),
         limits=stack([item.states for item in objects]),
         size=stack([item.size for item in objects]),
         box_center=stack([item.box_center for item in objects]),

@@ -1,25 +1,27 @@
 """Endless labeled videos: one instance whose joints, and perhaps the camera, move.
 
 The protocol of PM-Videos (paper Sec. 6.1.1), two harder ones, and one in which nothing moves; every
-frame is drawn by ``scene``.
+frame is drawn by ``frames``.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from caper_jax.articulation.category import Category
 from caper_jax.config import GeneratorConfig
 from caper_jax.errors import CaperError, unknown_name
+from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.synthetic import sensor as sensors
 from caper_jax.synthetic.camera import camera_arc, camera_pose, draw_camera
-from caper_jax.synthetic.frames import Batch, Keys, observe, part_poses, rest_diagonal
-from caper_jax.synthetic.instances import InstanceBank, build_bank, draw_instances
+from caper_jax.synthetic.frames import Batch, Keys, collect, observe, part_poses
+from caper_jax.synthetic.instances import InstanceBank, build_bank, draw_instances, split_key
 
 FRAMES = 30
 
@@ -108,7 +110,7 @@ def _video(
     frames: int,
 ) -> Batch:
     state_key, camera_key, arc_key, shared_key, frame_key = jax.random.split(key, 5)
-    view, diagonal = category.viewpoint, rest_diagonal(instance)
+    view, diagonal = category.viewpoint, rest_diagonal(instance.size, instance.box_center)
     states = _states(state_key, instance.limits, motion, frames)
     cameras = camera_arc(arc_key, draw_camera(camera_key, view), view, frames, motion.camera_speed)
     shared = Keys(*jax.random.split(shared_key, len(Keys._fields)))
@@ -213,3 +215,21 @@ class VideoGenerator:
         """
         settings = (self.category, self.config, self.frames)
         return _batch(key, self.bank, self._motion, *settings, videos)
+
+
+def collect_videos(
+    generator: VideoGenerator, seed: int, videos: int, size: int, title: str = "generating"
+) -> dict[str, Any]:
+    """Videos one after the other, as the arguments of ``hdf5.write`` that they decide.
+
+    Args:
+      generator: draws them, of its split.
+      seed: of the split's key, see ``split_key``.
+      size, title: see ``collect``.
+      videos: V.
+    """
+    batch = collect(generator.batch, split_key(generator.split, seed), videos, size, title)
+    batch = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), batch)
+    video, frame = np.divmod(np.arange(len(batch.points)), generator.frames)
+    names = [f"{v:05d}/{f:06d}" for v, f in zip(video, frame, strict=True)]
+    return {**vars(batch), "names": names, "video": video, "frame": frame}

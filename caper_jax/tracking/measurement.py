@@ -12,6 +12,7 @@ import numpy as np
 from caper_jax.articulation.category import Category
 from caper_jax.config import NetworkConfig
 from caper_jax.estimator import estimate
+from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.geometry.frames import canonicalize
 from caper_jax.geometry.raster_order import from_raster_order, raster_order, to_raster_order
 from caper_jax.lie import linalg, se3
@@ -137,9 +138,7 @@ def averaged(old: ObjectParameters, new: ObjectParameters) -> ObjectParameters:
 
 def diagonal(constants: ObjectParameters):
     """[] length of the diagonal of the object's box at rest."""
-    half = jnp.abs(constants.size) / 2
-    low, high = (constants.center - half).min(0), (constants.center + half).max(0)
-    return jnp.maximum(linalg.norm(high - low), 1e-3)
+    return jnp.maximum(rest_diagonal(jnp.abs(constants.size), constants.center), 1e-3)
 
 
 def own_coordinates(fix: PoseMeasurement, points):

@@ -14,11 +14,10 @@ from caper_jax.cli import generate, generate_layout
 from caper_jax.data.readers import open_dataset
 from caper_jax.data.types import validate
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solid_bounds import bounds, surface_points
 from caper_jax.synthetic.artimage_writer import LayoutWriter
+from caper_jax.synthetic.images import Image
 from caper_jax.synthetic.instances import draw_instances
-from caper_jax.synthetic.render import Image
-from caper_jax.synthetic.surface import surface_points
 
 SIZE = 64
 CAMERA = np.array([[91.4, 0.0, 31.5], [0.0, 90.0, 32.5], [0.0, 0.0, 1.0]])

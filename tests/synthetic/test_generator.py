@@ -17,10 +17,10 @@ from caper_jax.errors import CaperError
 from caper_jax.geometry.raster_order import grid_raster_order
 from caper_jax.geometry.solid_bounds import bounds
 from caper_jax.synthetic import sensor as sensors
-from caper_jax.synthetic.frames import Generator, draw_state_and_poses, systematic
+from caper_jax.synthetic.frames import Generator, draw_state_and_poses, systematic_sample
+from caper_jax.synthetic.images import render_image, write_frame
 from caper_jax.synthetic.instances import build_bank, draw_instances
 from caper_jax.synthetic.ray_casting import FAR, cast
-from caper_jax.synthetic.render import render_image, write_frame
 
 NAMES = categories.names()
 CLEAN = GeneratorConfig(
@@ -121,7 +121,7 @@ def test_picks_follow_one_another_evenly_along_the_scan():
     order = grid_raster_order(64)
     hits = order[hit.ravel()[order]]
     for count in (300, 5000):
-        picked = np.asarray(systematic(jax.random.key(0), jnp.asarray(hit), count))
+        picked = np.asarray(systematic_sample(jax.random.key(0), jnp.asarray(hit), count))
         place = np.argsort(hits)[np.searchsorted(np.sort(hits), picked)]
         np.testing.assert_array_equal(hits[place], picked)
         step = len(hits) / count
@@ -134,7 +134,7 @@ def test_the_last_pick_is_a_hit_however_it_is_rounded(monkeypatch):
     hit[20:70, 20:70] = True
     largest = jnp.float32(1 - 2**-23)  # that jax.random.uniform gives
     monkeypatch.setattr(jax.random, "uniform", lambda key, shape: jnp.full(shape, largest))
-    assert hit.ravel()[systematic(jax.random.key(0), jnp.asarray(hit), 1024)].all()
+    assert hit.ravel()[systematic_sample(jax.random.key(0), jnp.asarray(hit), 1024)].all()
 
 
 def test_part_poses_follow_the_joints(clean):

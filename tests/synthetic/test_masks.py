@@ -17,8 +17,8 @@ from caper_jax.config import GeneratorConfig
 from caper_jax.synthetic import masks
 from caper_jax.synthetic.frames import Generator
 from caper_jax.synthetic.instances import build_bank, draw_instances
+from caper_jax.synthetic.masks import add_clutter, spill_on_table, table_depth
 from caper_jax.synthetic.ray_casting import FAR
-from caper_jax.synthetic.surroundings import add_clutter, spill_on_table, table_depth
 
 SIDE, KEYS = 64, 300
 ROWS, COLUMNS = np.indices((SIDE, SIDE))

@@ -16,14 +16,14 @@ from _helpers.solid_meshes import part_mesh
 from _helpers.urdf_models import partnet_drawer, partnet_laptop
 from PIL import Image
 
+from caper_jax.articulation.mesh_object import MeshObject
 from caper_jax.categories.laptop import LAPTOP
 from caper_jax.cli import common, generate
 from caper_jax.data.readers import open_dataset
 from caper_jax.data.types import validate
-from caper_jax.data.urdf.canonical import ImportedObject
-from caper_jax.data.urdf.meshes import Mesh
-from caper_jax.data.urdf.reference import Reference
+from caper_jax.data.urdf.canonical import ImportedObject, JointMap
 from caper_jax.errors import CaperError
+from caper_jax.geometry.meshes import Mesh
 from caper_jax.synthetic.frames import draw_state_and_poses
 from caper_jax.synthetic.instances import build_bank, draw_instances
 from caper_jax.synthetic.ray_casting import cast
@@ -36,12 +36,16 @@ def generated(model, category, name="it"):
     """A generated object as if imported."""
     meshes = [part_mesh(solids) for solids in model.parts]
     parts = tuple(Mesh(np.asarray(m.vertices, float), np.asarray(m.faces)) for m in meshes)
-    reference = Reference(
+    reference = MeshObject(
         parts, category.joint_types, category.parents, model.axis, model.pivot, model.limits
     )
     boxes = np.array([mesh.bounds() for mesh in parts])
     size, center = np.ptp(boxes, axis=1), boxes.mean(1)
-    return ImportedObject(name, category, reference, size, center, model.limits, ("j",), ())
+    joints = tuple(
+        JointMap(f"j{j}", joint.type, 1.0, 0.0, (low, high), (low, high))
+        for j, (joint, (low, high)) in enumerate(zip(category.joints, model.limits, strict=True))
+    )
+    return ImportedObject(name, category, reference, size, center, joints, ())
 
 
 @pytest.fixture(scope="module")

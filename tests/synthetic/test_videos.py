@@ -14,8 +14,8 @@ from caper_jax.data.hdf5 import Hdf5Dataset
 from caper_jax.data.types import pose_problems, validate
 from caper_jax.errors import CaperError
 from caper_jax.synthetic.camera import camera_arc, camera_pose, draw_camera
+from caper_jax.synthetic.images import render_clip
 from caper_jax.synthetic.videos import MODES, VideoGenerator, video
-from caper_jax.synthetic.views import clip
 
 LAPTOP = categories.get("laptop")
 URDF = "no_such.urdf"
@@ -183,7 +183,7 @@ def test_wrong_arguments_are_named():
     with pytest.raises(CaperError, match="at least 2 frames, got 1"):
         video(jax.random.key(0), None, LAPTOP, CONFIG, "cam", 1)
     with pytest.raises(CaperError, match="at least 2 frames, got 1"):
-        clip(jax.random.key(0), None, LAPTOP, "none", np.eye(3), 64, 1, 0)
+        render_clip(jax.random.key(0), None, LAPTOP, "none", np.eye(3), 64, 1, 0)
 
 
 def test_generate_writes_videos_that_read_back(tmp_path, capsys):

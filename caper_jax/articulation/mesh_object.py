@@ -1,4 +1,4 @@
-"""An articulated object in one reference pose: meshes of the parts and joint lines beside them."""
+"""An articulated object made of meshes: its parts and joints in one reference pose."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caper_jax.data.urdf.load import UrdfModel, joint_motion
-from caper_jax.data.urdf.meshes import Mesh, join
-from caper_jax.data.urdf.parts import PartTree
+from caper_jax.articulation.kinematics import (
+    forward_kinematics_float64,
+    joint_transform_float64,
+)
+from caper_jax.geometry.meshes import Mesh
 
 _DIRECTIONS = 48  # of a half circle, over which widths are averaged
 
 
 @dataclass(frozen=True)
-class Reference:
+class MeshObject:
     """Parts and joints in one frame that all parts share in the reference pose; meters.
 
     Attributes:
@@ -40,19 +42,15 @@ class Reference:
 
     def poses(self, states: Sequence[float] | np.ndarray) -> np.ndarray:
         """[K, 4, 4] of the parts in the root's frame, at states from the reference pose."""
-        poses = [np.eye(4)]
-        for joint, parent in enumerate(self.parents):
-            motion = joint_motion(
-                self.kinds[joint], self.axis[joint], self.pivot[joint], states[joint]
-            )
-            poses.append(poses[parent] @ motion)
-        return np.stack(poses)
+        return forward_kinematics_float64(
+            np.eye(4), self.axis, self.pivot, states, self.kinds, self.parents
+        )
 
-    def at(self, states: np.ndarray) -> Reference:
+    def at(self, states: np.ndarray) -> MeshObject:
         """The same object with another reference pose; states count from there."""
         poses = self.poses(states)
         carriers = poses[list(self.parents)]
-        return Reference(
+        return MeshObject(
             tuple(mesh.moved(pose) for mesh, pose in zip(self.parts, poses, strict=True)),
             self.kinds,
             self.parents,
@@ -61,10 +59,10 @@ class Reference:
             self.limits - np.asarray(states)[:, None],
         )
 
-    def moved(self, pose: np.ndarray, scale: float = 1.0) -> Reference:
+    def moved(self, pose: np.ndarray, scale: float = 1.0) -> MeshObject:
         """In another frame (old -> new [4, 4]), then with all lengths times ``scale``."""
         sliding = np.array([kind == "prismatic" for kind in self.kinds], bool)
-        return Reference(
+        return MeshObject(
             tuple(mesh.moved(pose).scaled(scale) for mesh in self.parts),
             self.kinds,
             self.parents,
@@ -73,17 +71,17 @@ class Reference:
             self.limits * np.where(sliding, scale, 1.0)[:, None],
         )
 
-    def flipped(self, signs: np.ndarray) -> Reference:
+    def flipped(self, signs: np.ndarray) -> MeshObject:
         """With the axes of the joints with sign -1 turned round, and their limits with them."""
         limits = np.where(signs[:, None] < 0, -self.limits[:, ::-1], self.limits)
-        return Reference(
+        return MeshObject(
             self.parts, self.kinds, self.parents, self.axis * signs[:, None], self.pivot, limits
         )
 
-    def ordered(self, order: Sequence[int]) -> Reference:
+    def ordered(self, order: Sequence[int]) -> MeshObject:
         """With joint ``order[j]`` as joint j; for joints that all hang on the root."""
         rows = list(order)
-        return Reference(
+        return MeshObject(
             (self.parts[0], *(self.parts[row + 1] for row in rows)),
             tuple(self.kinds[row] for row in rows),
             self.parents,
@@ -92,9 +90,9 @@ class Reference:
             self.limits[rows],
         )
 
-    def exchanged(self) -> Reference:
+    def exchanged(self) -> MeshObject:
         """Two parts, the other one the root: seen from its child, a joint turns the other way."""
-        return Reference(
+        return MeshObject(
             self.parts[::-1], self.kinds, self.parents, -self.axis, self.pivot, self.limits
         )
 
@@ -129,7 +127,9 @@ class Reference:
 
         Along a slide; in the plane of a turn, the mean over all directions.
         """
-        motion = joint_motion(self.kinds[joint], self.axis[joint], self.pivot[joint], state)
+        motion = joint_transform_float64(
+            self.kinds[joint], self.axis[joint], self.pivot[joint], state
+        )
         child = self.parts[joint + 1].moved(motion)
         points = np.concatenate([self.parts[self.parents[joint]].vertices, child.vertices])
         if self.kinds[joint] == "prismatic":
@@ -138,30 +138,3 @@ class Reference:
         angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
         directions = np.stack([np.cos(angles), np.sin(angles)], -1) @ self.across(joint)
         return float(np.ptp(points @ directions.T, axis=0).mean())
-
-
-def reference(model: UrdfModel, tree: PartTree) -> Reference:
-    """The object as the file holds it at state 0, in the frame of the file's root link.
-
-    Joints that mimic others stand where ``tree.locked``, and state 0 of the rest, put them.
-    """
-    poses = model.link_poses(tree.locked)
-    parts = []
-    for links in tree.links:
-        meshes = [(model.links[name], poses[name]) for name in links]
-        parts.append(join([mesh.moved(pose) for mesh, pose in meshes if mesh is not None]))
-    axes, pivots, limits = [], [], []
-    for part in tree.joints:
-        frame = poses[part.joint.parent] @ part.joint.origin
-        # Seen from its child, a joint turns the other way.
-        axes.append(frame[:3, :3] @ part.joint.axis * (-1.0 if part.reversed else 1.0))
-        pivots.append(frame[:3, 3])
-        limits.append(part.joint.limits)
-    return Reference(
-        tuple(parts),
-        tuple(part.joint.kind for part in tree.joints),
-        tuple(part.parent for part in tree.joints),
-        np.array(axes),
-        np.array(pivots),
-        np.array(limits),
-    )

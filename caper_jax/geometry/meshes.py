@@ -113,7 +113,7 @@ def _plain(vertices: Any, faces: Any) -> Mesh:
     return Mesh(vertices[used], faces.reshape(-1, 3))
 
 
-def shape_mesh(geometry: Any, where: str) -> Mesh:
+def primitive_mesh(geometry: Any, where: str) -> Mesh:
     """A URDF box, cylinder (along z) or sphere, centered on its frame.
 
     Raises:

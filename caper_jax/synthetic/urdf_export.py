@@ -10,9 +10,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from caper_jax.articulation.category import Category, ObjectModel
-from caper_jax.data.urdf.meshes import NEEDS_MESH
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
+from caper_jax.geometry.meshes import NEEDS_MESH
 from caper_jax.geometry.solids import Solid
 from caper_jax.synthetic.instances import centered
 
