@@ -26,7 +26,6 @@ from caper_jax.errors import CaperError
 from caper_jax.geometry.solid_bounds import bounds, surface_points
 from caper_jax.synthetic.images import Image
 
-SPLITS = ("train", "val", "test")
 _POINTS_PER_PART = 2048
 _BACKGROUND = 255
 # Our coordinates in the order of the URDF.

@@ -10,11 +10,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from caper_jax.articulation.category import Category, ObjectModel
+from caper_jax.articulation.shapes import centered
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
 from caper_jax.geometry.meshes import NEEDS_MESH
 from caper_jax.geometry.solids import Solid
-from caper_jax.synthetic.instances import centered
 
 SECTIONS = 96  # of a circle
 URDF_FILE = "mobility.urdf"  # its name in PartNet-Mobility
