@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Float, Shaped
 
 from caper_jax.articulation.joints import joint_transforms
 from caper_jax.errors import CaperError, unknown_name
@@ -60,8 +61,11 @@ def forward_kinematics(
 
 
 def joint_transform_float64(
-    joint_type: str, axis: np.ndarray, pivot: np.ndarray, state: float
-) -> np.ndarray:
+    joint_type: str,
+    axis: Float[np.ndarray, " 3"],
+    pivot: Float[np.ndarray, " 3"],
+    state: float,
+) -> Float[np.ndarray, "4 4"]:
     """``joints.joint_transform`` of one joint with a unit axis, in float64 without JAX.
 
     For files, whose meshes must not move by the rounding of float32.
@@ -92,13 +96,13 @@ def joint_transform_float64(
 
 
 def forward_kinematics_float64(
-    root: np.ndarray,
-    axis: np.ndarray,
-    pivot: np.ndarray,
-    state: Sequence[float] | np.ndarray,
+    root: Float[np.ndarray, "4 4"],
+    axis: Float[np.ndarray, "J 3"],
+    pivot: Float[np.ndarray, "J 3"],
+    state: Shaped[np.ndarray, " J"],
     joint_types: Sequence[str],
     parents: Sequence[int],
-) -> np.ndarray:
+) -> Float[np.ndarray, "K 4 4"]:
     """``forward_kinematics`` of one object with unit axes, in float64 without JAX.
 
     Args:
@@ -118,7 +122,7 @@ def forward_kinematics_float64(
     poses = [np.asarray(root, np.float64)]
     for joint, parent in enumerate(parents):
         motion = joint_transform_float64(
-            joint_types[joint], axis[joint], pivot[joint], state[joint]
+            joint_types[joint], axis[joint], pivot[joint], float(state[joint])
         )
         poses.append(poses[parent] @ motion)
     return np.stack(poses)

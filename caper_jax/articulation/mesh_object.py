@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
 from caper_jax.articulation.kinematics import (
     forward_kinematics_float64,
@@ -32,21 +33,21 @@ class MeshObject:
     parts: tuple[Mesh, ...]
     kinds: tuple[str, ...]
     parents: tuple[int, ...]
-    axis: np.ndarray
-    pivot: np.ndarray
-    limits: np.ndarray
+    axis: Float[np.ndarray, "J 3"]
+    pivot: Float[np.ndarray, "J 3"]
+    limits: Float[np.ndarray, "J 2"]
 
     @property
     def num_joints(self) -> int:
         return len(self.kinds)
 
-    def poses(self, states: Sequence[float] | np.ndarray) -> np.ndarray:
+    def poses(self, states: Shaped[np.ndarray, " J"]) -> Float[np.ndarray, "K 4 4"]:
         """[K, 4, 4] of the parts in the root's frame, at states from the reference pose."""
         return forward_kinematics_float64(
             np.eye(4), self.axis, self.pivot, states, self.kinds, self.parents
         )
 
-    def at(self, states: np.ndarray) -> MeshObject:
+    def at(self, states: Shaped[np.ndarray, " J"]) -> MeshObject:
         """The same object with another reference pose; states count from there."""
         poses = self.poses(states)
         carriers = poses[list(self.parents)]
@@ -59,7 +60,7 @@ class MeshObject:
             self.limits - np.asarray(states)[:, None],
         )
 
-    def moved(self, pose: np.ndarray, scale: float = 1.0) -> MeshObject:
+    def moved(self, pose: Float[np.ndarray, "4 4"], scale: float = 1.0) -> MeshObject:
         """In another frame (old -> new [4, 4]), then with all lengths times ``scale``."""
         sliding = np.array([kind == "prismatic" for kind in self.kinds], bool)
         return MeshObject(
@@ -71,7 +72,7 @@ class MeshObject:
             self.limits * np.where(sliding, scale, 1.0)[:, None],
         )
 
-    def flipped(self, signs: np.ndarray) -> MeshObject:
+    def flipped(self, signs: Float[np.ndarray, " J"]) -> MeshObject:
         """With the axes of the joints with sign -1 turned round, and their limits with them."""
         limits = np.where(signs[:, None] < 0, -self.limits[:, ::-1], self.limits)
         return MeshObject(
@@ -96,19 +97,19 @@ class MeshObject:
             self.parts[::-1], self.kinds, self.parents, -self.axis, self.pivot, self.limits
         )
 
-    def bounds(self) -> np.ndarray:
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
         """[2, 3] corners of the whole object's box."""
         boxes = np.array([mesh.bounds() for mesh in self.parts])
         return np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
 
-    def across(self, joint: int) -> np.ndarray:
+    def across(self, joint: int) -> Float[np.ndarray, "2 3"]:
         """[2, 3] orthonormal, e1 x e2 = axis: the plane in which a revolute joint turns."""
         axis = self.axis[joint]
         first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
         first /= np.linalg.norm(first)
         return np.stack([first, np.cross(axis, first)])
 
-    def direction(self, part: int, joint: int) -> np.ndarray:
+    def direction(self, part: int, joint: int) -> Float[np.ndarray, " 3"]:
         """[3] unit vector across a joint's axis, away from it, along which a part is longest."""
         plane = self.across(joint)
         _, mean, second = self.parts[part].moments()
@@ -116,7 +117,9 @@ class MeshObject:
         away = mean - self.pivot[joint]
         return longest if longest @ away >= 0 else -longest
 
-    def turn(self, joint: int, start: np.ndarray, end: np.ndarray) -> float:
+    def turn(
+        self, joint: int, start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"]
+    ) -> float:
         """Angle in (-pi, pi] about a joint's axis from one direction to another."""
         plane = self.across(joint)
         (a, b), (c, d) = plane @ start, plane @ end

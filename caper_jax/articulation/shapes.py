@@ -73,7 +73,7 @@ def draw_shapes(category: Category, count: int, split: str, seed: int) -> list[O
     return models
 
 
-def _problem(category: Category, model: ObjectModel) -> str | None:
+def _problem(category: Category, model: Any) -> str | None:
     """What keeps an object from being an instance of a category, or None."""
     if not isinstance(model, ObjectModel):
         return f"{type(model).__name__}, not an ObjectModel"

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from caper_jax.articulation.mesh_object import MeshObject
 
@@ -29,12 +30,12 @@ class CanonicalAxes(NamedTuple):
       assumed: which of "up" and "front" only a convention says.
     """
 
-    up: np.ndarray
-    front: np.ndarray
+    up: Float[np.ndarray, " 3"]
+    front: Float[np.ndarray, " 3"]
     assumed: tuple[str, ...] = ()
 
 
-def rest_at_zero(ref: MeshObject) -> np.ndarray:
+def rest_at_zero(ref: MeshObject) -> Float[np.ndarray, " J"]:
     """[J] the file's state 0 of every joint."""
     return np.zeros(ref.num_joints)
 
@@ -71,7 +72,9 @@ class UrdfRule:
     partnet_classes: tuple[str, ...] = ()
 
 
-def snap_state(state: float, limits: np.ndarray, degrees: float, quarter: bool = False) -> float:
+def snap_state(
+    state: float, limits: Float[np.ndarray, " 2"], degrees: float, quarter: bool = False
+) -> float:
     """The first of 0, the limits and (if ``quarter``) 90 deg from them that is near a state.
 
     Args:
@@ -101,7 +104,7 @@ def opening_sign(ref: MeshObject, joint: int) -> float:
     return 1.0 if ref.width(joint, step) >= ref.width(joint, -step) else -1.0
 
 
-def closed_states(ref: MeshObject) -> np.ndarray:
+def closed_states(ref: MeshObject) -> Float[np.ndarray, " J"]:
     """[J] every joint at 0 or at the limit where the object is most compact, 0 if nearly as good.
 
     A range that starts a little before the lid is shut counts from 0 all the same.
@@ -119,7 +122,7 @@ def closed_states(ref: MeshObject) -> np.ndarray:
     return np.array(states)
 
 
-def level(direction: np.ndarray) -> np.ndarray:
+def level(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
     """[3] an axis of the file that is within 8 deg of a direction, else the direction.
 
     A wedge lies on the table with its underside, not with its middle.
@@ -130,7 +133,7 @@ def level(direction: np.ndarray) -> np.ndarray:
     return np.eye(3)[index] * np.sign(direction[index])
 
 
-def along_positive(direction: np.ndarray) -> np.ndarray:
+def along_positive(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
     """[3] a direction or its opposite, whichever points along a positive axis of the file."""
     return direction * np.sign(direction[np.argmax(np.abs(direction))])
 
@@ -141,6 +144,6 @@ def hinged_axes(ref: MeshObject) -> CanonicalAxes:
     return CanonicalAxes(opening_sign(ref, 0) * np.cross(ref.axis[0], front), front)
 
 
-def opens_along(axis: np.ndarray) -> Callable[[MeshObject], np.ndarray]:
+def opens_along(axis: Float[np.ndarray, " 3"]) -> Callable[[MeshObject], np.ndarray]:
     """The ``opening`` of a category all of whose joints open about or along one canonical axis."""
     return lambda ref: np.tile(axis, (ref.num_joints, 1))

@@ -32,11 +32,13 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Float
 
 from caper_jax.lie.linalg import apply, as_floating, dot, multiply, transpose
 
@@ -70,7 +72,9 @@ def corners(
     return apply(rotation[..., None, :, :], local) + translation[..., None, :]
 
 
-def rest_diagonal(size, center):
+def rest_diagonal(
+    size: Float[Any, "*batch K 3"], center: Float[Any, "*batch K 3"]
+) -> Float[Any, "*batch"]:
     """Diagonal [...] of the axis-aligned box around all parts of an object at rest.
 
     Args:

@@ -11,6 +11,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
@@ -43,15 +44,15 @@ class Batch:
         another part nor something else, were in front of it; None unless measured.
     """
 
-    points: Any
-    labels: Any
+    points: Float[Any, "*B N 3"]
+    labels: Int[Any, "*B N"]
     pose: ArticulatedPose
-    visible: Any
+    visible: Int[Any, "*B K"]
     instance: Any
-    visibility: Any = None
+    visibility: Float[Any, "*B K"] | None = None
 
 
-def systematic_sample(key, hit, count: int):
+def systematic_sample(key: PRNGKeyArray, hit: Bool[Array, "G G"], count: int) -> Int[Array, " N"]:
     """Raster indices [count] of hits [G, G], evenly spread in scan order; repeating if too few.
 
     The r-th pick is hit number floor((r + u) n / count): no sort, uniform over the image.
@@ -67,7 +68,9 @@ def systematic_sample(key, hit, count: int):
     return order[place]
 
 
-def draw_state_and_poses(key, instance: InstanceBank, category: Category):
+def draw_state_and_poses(
+    key: PRNGKeyArray, instance: InstanceBank, category: Category
+) -> tuple[Float[Array, " J"], Float[Array, "K 4 4"], Float[Any, ""]]:
     """Joint states over the instance's range, and a camera around it.
 
     Returns:
@@ -82,7 +85,12 @@ def draw_state_and_poses(key, instance: InstanceBank, category: Category):
     return state, part_poses(root, instance, state, category), diagonal
 
 
-def part_poses(root, instance: InstanceBank, state, category: Category):
+def part_poses(
+    root: Float[Any, "*batch 4 4"],
+    instance: InstanceBank,
+    state: Float[Any, "*states J"],
+    category: Category,
+) -> Float[Array, "*states K 4 4"]:
     """Poses [..., K, 4, 4] of all parts from the root's [..., 4, 4] and the states [..., J]."""
     return forward_kinematics(
         root,
@@ -94,40 +102,44 @@ def part_poses(root, instance: InstanceBank, state, category: Category):
     )
 
 
-class Keys(NamedTuple):
+class FrameKeys(NamedTuple):
     """PRNG keys of a frame; a video keeps some of them from frame to frame."""
 
-    scene: Any
-    grid: Any
-    mask: Any
-    sensor: Any
-    loss: Any
-    pick: Any
-    noise: Any
-    residue: Any
+    scene: PRNGKeyArray
+    grid: PRNGKeyArray
+    mask: PRNGKeyArray
+    sensor: PRNGKeyArray
+    loss: PRNGKeyArray
+    pick: PRNGKeyArray
+    noise: PRNGKeyArray
+    residue: PRNGKeyArray
 
 
 def render_frame(
-    key, instance: InstanceBank, category: Category, config: GeneratorConfig, mix
+    key: PRNGKeyArray,
+    instance: InstanceBank,
+    category: Category,
+    config: GeneratorConfig,
+    mix: sensors.Sensor,
 ) -> Batch:
     """One labeled frame of one instance (InstanceBank without its leading axis).
 
     Returns:
       Batch without its leading axis; ``instance`` is None.
     """
-    keys = Keys(*jax.random.split(key, 8))
+    keys = FrameKeys(*jax.random.split(key, 8))
     state, poses, _ = draw_state_and_poses(keys.scene, instance, category)
     return observe(keys, instance, state, poses, category, config, mix)
 
 
 def observe(
-    keys: Keys,
+    keys: FrameKeys,
     instance: InstanceBank,
-    state,
-    poses,
+    state: Float[Any, " J"],
+    poses: Float[Any, "K 4 4"],
     category: Category,
     config: GeneratorConfig,
-    mix,
+    mix: sensors.Sensor,
 ) -> Batch:
     """What a depth camera and a mask show of one instance in a given pose.
 
@@ -153,11 +165,12 @@ def observe(
     if config.measure_visibility:
         visibility = visible / jnp.maximum((alone < FAR).sum(axis=1), 1)
 
-    sensor = sensors.draw(keys.sensor, mix)
-    surface = sensors.surface(depth, hit, rays)
-    seen = sensors.lose(keys.loss, sensor, surface, hit)
+    sensor = sensors.draw_sensor(keys.sensor, mix)
+    surface = sensors.surface_map(depth, hit, rays)
+    seen = sensors.valid_pixels(keys.loss, sensor, surface, hit)
     if config.dropout > 0 or config.holes > 0:
-        lost = masks.drop(jax.random.fold_in(keys.loss, 1), hit, config.dropout, config.holes)
+        lost_key = jax.random.fold_in(keys.loss, 1)
+        lost = masks.missing_depth(lost_key, hit, config.dropout, config.holes)
         seen = masks.keep_most(seen & ~lost, seen)
     seen = jnp.where(seen.any(), seen, hit)
 
@@ -271,7 +284,7 @@ class Generator:
         # The bank is an argument: as a constant it would go through the compiler.
         self._batch = jax.jit(self.draw, static_argnames="batch_size")
 
-    def draw(self, key, batch_size: int, bank: InstanceBank | None = None) -> Batch:
+    def draw(self, key: PRNGKeyArray, batch_size: int, bank: InstanceBank | None = None) -> Batch:
         """Traceable form of ``batch``: call it inside a larger jitted function."""
         bank = self.bank if bank is None else bank
         pick, rest = jax.random.split(key)
@@ -281,7 +294,7 @@ class Generator:
         frames = jax.vmap(frame)(jax.random.split(rest, batch_size), instances)
         return replace(frames, instance=index)
 
-    def batch(self, key, batch_size: int) -> Batch:
+    def batch(self, key: PRNGKeyArray, batch_size: int) -> Batch:
         """A batch of frames; the same key gives the same batch.
 
         Args:
@@ -292,7 +305,11 @@ class Generator:
 
 
 def collect(
-    draw: Callable[[Any, int], Batch], key: Any, total: int, size: int, title: str = "generating"
+    draw: Callable[[PRNGKeyArray, int], Batch],
+    key: PRNGKeyArray,
+    total: int,
+    size: int,
+    title: str = "generating",
 ) -> Batch:
     """``total`` frames or videos as numpy arrays.
 

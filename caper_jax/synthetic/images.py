@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
@@ -38,14 +39,19 @@ class Image:
       pose: ArticulatedPose (numpy, no batch axis).
     """
 
-    depth: np.ndarray
-    parts: np.ndarray
-    intrinsics: np.ndarray
+    depth: Float[np.ndarray, "H W"]
+    parts: Int[np.ndarray, "H W"]
+    intrinsics: Float[np.ndarray, "3 3"]
     pose: ArticulatedPose
 
 
 def render_image(
-    key, instance: InstanceBank, category: Category, noise: str, width: int = 640, height: int = 480
+    key: PRNGKeyArray,
+    instance: InstanceBank,
+    category: Category,
+    noise: str,
+    width: int = 640,
+    height: int = 480,
 ) -> Image:
     """One instance on a table, drawn as by ``frames`` and seen whole by a pinhole camera.
 
@@ -66,13 +72,13 @@ def render_image(
 
 
 def render_pose(
-    key,
+    key: PRNGKeyArray,
     instance: InstanceBank,
-    state,
-    poses,
+    state: Float[Any, " J"],
+    poses: Float[Any, "K 4 4"],
     category: Category,
     noise: str,
-    intrinsics: np.ndarray,
+    intrinsics: Float[np.ndarray, "3 3"],
     width: int = 640,
     height: int = 480,
 ) -> Image:
@@ -145,9 +151,9 @@ def _look(
     depth, parts = jnp.where(on_table, table, depth), jnp.where(on_table, -1, parts)
 
     hit = depth < FAR
-    surface = sensors.surface(depth, hit, (x, y))
+    surface = sensors.surface_map(depth, hit, (x, y))
     noise_key, loss_key = jax.random.split(key)
-    seen = sensors.lose(loss_key, sensor, surface, hit)
+    seen = sensors.valid_pixels(loss_key, sensor, surface, hit)
     measured = sensors.measure(noise_key, sensor, surface, (x, y))[..., 2]
     return jnp.where(seen, measured, 0.0), jnp.where(seen, parts, -1)
 
@@ -165,7 +171,12 @@ def _pose(instance: InstanceBank, state, poses) -> ArticulatedPose:
 
 
 def render_still(
-    key, instance: InstanceBank, category: Category, noise: str, intrinsics: np.ndarray, size: int
+    key: PRNGKeyArray,
+    instance: InstanceBank,
+    category: Category,
+    noise: str,
+    intrinsics: Float[np.ndarray, "3 3"],
+    size: int,
 ) -> Image:
     """One image in a random state, seen whole.
 
@@ -184,11 +195,11 @@ def render_still(
 
 
 def render_clip(
-    key,
+    key: PRNGKeyArray,
     instance: InstanceBank,
     category: Category,
     noise: str,
-    intrinsics: np.ndarray,
+    intrinsics: Float[np.ndarray, "3 3"],
     size: int,
     frames: int,
     moving: int,

@@ -9,6 +9,7 @@ from typing import Any
 import flax.struct
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, PRNGKeyArray
 
 from caper_jax.articulation.category import Category, ObjectModel
 from caper_jax.articulation.shapes import (
@@ -37,10 +38,10 @@ class SolidGroup:
       hole: kind of the solid cut away, or None.
     """
 
-    to_unit: Any
-    center: Any
-    half_axes: Any
-    valid: Any
+    to_unit: Float[Any, "*n M 3 3"]
+    center: Float[Any, "*n M 3"]
+    half_axes: Float[Any, "*n M 3 3"]
+    valid: Bool[Any, "*n M"]
     taper: Any
     hole_to_unit: Any
     hole_center: Any
@@ -62,11 +63,11 @@ class InstanceBank:
     """
 
     groups: dict[str, SolidGroup]
-    joint_axis: Any
-    joint_pivot: Any
-    limits: Any
-    size: Any
-    box_center: Any
+    joint_axis: Float[Any, "*n J 3"]
+    joint_pivot: Float[Any, "*n J 3"]
+    limits: Float[Any, "*n J 2"]
+    size: Float[Any, "*n K 3"]
+    box_center: Float[Any, "*n K 3"]
 
     @property
     def num_instances(self) -> int:
@@ -108,7 +109,7 @@ def statistics(category: Category, count: int = 1500, seed: int = 0) -> dict[str
     return {name: np.asarray(value).tolist() for name, value in drawn._asdict().items()}
 
 
-def split_key(split: str, seed: int):
+def split_key(split: str, seed: int) -> PRNGKeyArray:
     """PRNG key of the frames of a split: cameras, states, sensors and which instances they show.
 
     "test" has the plain key of the seed, for the published figures rest on its frames; the others

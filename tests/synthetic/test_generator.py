@@ -257,9 +257,9 @@ class TestSensor:
         x, y = np.meshgrid(axis, axis)
         depth = (distance / (1.0 + np.tan(tilt) * x)).astype(np.float32)
         hit = np.ones_like(depth, bool)
-        surface = sensors.surface(jnp.asarray(depth), jnp.asarray(hit), (x, y))
+        surface = sensors.surface_map(jnp.asarray(depth), jnp.asarray(hit), (x, y))
         points = sensors.measure(jax.random.key(0), sensor, surface, (x, y))
-        seen = sensors.lose(jax.random.key(1), sensor, surface, hit)
+        seen = sensors.valid_pixels(jax.random.key(1), sensor, surface, hit)
         inner = np.s_[1:-1, 1:-1]
         return surface, np.asarray(points)[inner], np.asarray(seen)[inner], depth[inner], (x, y)
 
@@ -306,9 +306,9 @@ class TestSensor:
         x, y = np.meshgrid(np.linspace(-0.3, 0.3, 80), np.linspace(-0.3, 0.3, 80))
         depth = np.where(np.arange(80)[None, :] < 40, 1.0, 1.5) * np.ones((80, 80))
         hit = np.ones((80, 80), bool)
-        surface = sensors.surface(jnp.asarray(depth), jnp.asarray(hit), (x, y))
-        seen = np.asarray(sensors.lose(jax.random.key(1), sensor, surface, jnp.asarray(hit)))
-        lost = ~seen[2:-2, 2:-2]
+        surface = sensors.surface_map(jnp.asarray(depth), jnp.asarray(hit), (x, y))
+        seen = sensors.valid_pixels(jax.random.key(1), sensor, surface, jnp.asarray(hit))
+        lost = ~np.asarray(seen)[2:-2, 2:-2]
         edge = lost[:, 37:39]
         assert 0.2 < edge.mean() < 0.5
         assert not lost[:, :36].any() and not lost[:, 40:].any()

@@ -133,7 +133,8 @@ def test_cameras_may_be_turned_about_their_axes():
     level, turned = Viewpoint(), Viewpoint(camera_roll=90.0)
     keys = jax.random.split(jax.random.key(0), 20)
     for key in keys:
-        one, other = (draw_camera(key, view).replace(aside=np.zeros(2)) for view in (level, turned))
+        cameras = (draw_camera(key, view) for view in (level, turned))
+        one, other = (camera.replace(image_offset=np.zeros(2)) for camera in cameras)
         first, second = (np.asarray(camera_pose(camera, level, 0.7)) for camera in (one, other))
         # x right, y down: a turn about z is clockwise in the image.
         turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()

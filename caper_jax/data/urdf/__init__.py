@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.mesh_object import MeshObject
@@ -29,8 +30,8 @@ class ImportOptions:
       scale: factor for all lengths, or None for the category's mean size.
     """
 
-    up: np.ndarray | None = None
-    front: np.ndarray | None = None
+    up: Shaped[np.ndarray, " 3"] | None = None
+    front: Shaped[np.ndarray, " 3"] | None = None
     rest: Mapping[str, float] = field(default_factory=dict)
     parts: tuple[str, ...] | None = None
     scale: float | None = 1.0
@@ -108,13 +109,13 @@ class ImportedObject:
     name: str
     category: Category
     at_rest: MeshObject
-    size: np.ndarray
-    box_center: np.ndarray
+    size: Float[np.ndarray, "K 3"]
+    box_center: Float[np.ndarray, "K 3"]
     joints: tuple[JointMap, ...]
     notes: tuple[str, ...]
 
     @property
-    def states(self) -> np.ndarray:
+    def states(self) -> Float[np.ndarray, "J 2"]:
         """[J, 2] range from which states are drawn, radians or meters from rest."""
         return np.array([joint.state_range for joint in self.joints])
 

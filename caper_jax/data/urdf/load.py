@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from caper_jax.articulation.kinematics import joint_transform_float64
 from caper_jax.data.images import read_json
@@ -50,8 +51,8 @@ class UrdfJoint:
     kind: Kind
     parent: str
     child: str
-    origin: np.ndarray
-    axis: np.ndarray
+    origin: Float[np.ndarray, "4 4"]
+    axis: Float[np.ndarray, " 3"]
     limits: tuple[float, float]
     remark: str = ""
     mimic: tuple[str, float, float] | None = None
@@ -84,7 +85,7 @@ class UrdfModel:
     labels: dict[str, str] = field(default_factory=dict)
     object_class: str = ""
 
-    def link_poses(self, states: Mapping[str, float]) -> dict[str, np.ndarray]:
+    def link_poses(self, states: Mapping[str, float]) -> dict[str, Float[np.ndarray, "4 4"]]:
         """Poses [4, 4] of all links in the root link's frame; joints left out stand at 0."""
         outgoing: dict[str, list[UrdfJoint]] = {}
         for joint in self.joints:
