@@ -102,6 +102,21 @@ def part_poses(
     )
 
 
+def articulated_pose(
+    instance: InstanceBank, state: Float[Any, "*batch J"], poses: Float[Any, "*batch K 4 4"]
+) -> ArticulatedPose:
+    """Ground truth of instances in given states and poses of their parts."""
+    return ArticulatedPose(
+        rotation=poses[..., :3, :3],
+        translation=poses[..., :3, 3],
+        size=instance.size,
+        box_center=instance.box_center,
+        joint_axis=instance.joint_axis,
+        joint_pivot=instance.joint_pivot,
+        joint_state=state,
+    )
+
+
 class FrameKeys(NamedTuple):
     """PRNG keys of a frame; a video keeps some of them from frame to frame."""
 
@@ -185,15 +200,7 @@ def observe(
     if config.depth_scale > 0:
         error = jax.random.normal(jax.random.fold_in(keys.sensor, 1))
         points *= 1.0 + config.depth_scale * jnp.clip(error, -3.0, 3.0)
-    pose = ArticulatedPose(
-        rotation=poses[:, :3, :3],
-        translation=poses[:, :3, 3],
-        size=instance.size,
-        box_center=instance.box_center,
-        joint_axis=instance.joint_axis,
-        joint_pivot=instance.joint_pivot,
-        joint_state=state,
-    )
+    pose = articulated_pose(instance, state, poses)
     return Batch(points, labels, pose, visible, None, visibility)
 
 

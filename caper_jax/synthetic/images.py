@@ -17,7 +17,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.synthetic import sensor as sensors
-from caper_jax.synthetic.frames import draw_state_and_poses, part_poses
+from caper_jax.synthetic.frames import articulated_pose, draw_state_and_poses, part_poses
 from caper_jax.synthetic.instances import InstanceBank
 from caper_jax.synthetic.masks import table_depth
 from caper_jax.synthetic.ray_casting import FAR, cast, projected_bounds
@@ -101,7 +101,7 @@ def render_pose(
     depth, parts = _look(
         key, instance, poses, _sensor(noise), camera, category, width=width, height=height
     )
-    pose = jax.tree.map(np.asarray, _pose(instance, state, poses))
+    pose = jax.tree.map(np.asarray, articulated_pose(instance, state, poses))
     return Image(np.asarray(depth), np.asarray(parts), np.asarray(intrinsics, np.float64), pose)
 
 
@@ -126,7 +126,7 @@ def _render(key, instance: InstanceBank, sensor, category: Category, width: int,
     depth, parts = _look(
         keys[3], instance, poses, sensor, intrinsics, category, width=width, height=height
     )
-    return depth, parts, intrinsics, _pose(instance, state, poses)
+    return depth, parts, intrinsics, articulated_pose(instance, state, poses)
 
 
 @partial(jax.jit, static_argnames=("category", "width", "height"))
@@ -156,18 +156,6 @@ def _look(
     seen = sensors.valid_pixels(loss_key, sensor, surface, hit)
     measured = sensors.measure(noise_key, sensor, surface, (x, y))[..., 2]
     return jnp.where(seen, measured, 0.0), jnp.where(seen, parts, -1)
-
-
-def _pose(instance: InstanceBank, state, poses) -> ArticulatedPose:
-    return ArticulatedPose(
-        rotation=poses[:, :3, :3],
-        translation=poses[:, :3, 3],
-        size=instance.size,
-        box_center=instance.box_center,
-        joint_axis=instance.joint_axis,
-        joint_pivot=instance.joint_pivot,
-        joint_state=state,
-    )
 
 
 def render_still(

@@ -16,13 +16,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from caper_jax.articulation.category import Category
-from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.urdf import ImportedObject
 from caper_jax.errors import CaperError
 from caper_jax.geometry.meshes import NEEDS_MESH, Mesh
 from caper_jax.geometry.raster_order import grid_raster_order
 from caper_jax.synthetic import sensor as sensors
-from caper_jax.synthetic.frames import Batch, FrameKeys, draw_state_and_poses
+from caper_jax.synthetic.frames import Batch, FrameKeys, articulated_pose, draw_state_and_poses
 from caper_jax.synthetic.instances import InstanceBank, split_key
 
 
@@ -155,15 +154,7 @@ def render_frames(
         rows.append(_observe(keys, index, caster, poses[index], rays, mix, picks[index]))
         report(1)
     points, labels, visible, visibility = (np.stack(column) for column in zip(*rows, strict=True))
-    pose = ArticulatedPose(
-        rotation=poses[:, :, :3, :3],
-        translation=poses[:, :, :3, 3],
-        size=bank.size[instance],
-        box_center=bank.box_center[instance],
-        joint_axis=bank.joint_axis[instance],
-        joint_pivot=bank.joint_pivot[instance],
-        joint_state=states,
-    )
+    pose = articulated_pose(instances, states, poses)
     return Batch(points, labels, pose, visible, instance.astype(np.int32), visibility)
 
 

@@ -214,19 +214,10 @@ def test_generate_writes_videos_that_read_back(tmp_path, capsys):
     ("options", "message"),
     [
         (["--videos", "2", "--frames", "3"], "--videos and --frames exclude each other"),
-        (["--videos", "2", "--images"], "--videos and --images exclude each other"),
         (["--mode", "cam"], "--mode is of videos: add --videos N"),
-        (["--frames-per-video", "3"], "--frames-per-video is of videos"),
-        (["--points", "5"], "--points must be at least 16, got 5"),
         (["--urdf", URDF, "--points", "1"], "--points must be at least 16, got 1"),
-        (["--urdf", URDF, "--grid", "1"], "--grid must be at least 8, got 1"),
-        (["--urdf", URDF, "--instances", "3"], "--instances has no effect with --urdf"),
-        (["--urdf", URDF, "--noise", "kinekt"], "unknown --noise 'kinekt'; did you mean 'kinect'"),
         ([*ARTIMAGE, "--noise", "kinekt"], "unknown --noise 'kinekt'"),
-        ([*ARTIMAGE, "--grid", "96"], "--grid has no effect with --layout"),
         ([*IMAGES, "--grid", "96"], "--grid has no effect with --images: leave it out"),
-        ([*IMAGES, "--points", "1024"], "--points has no effect with --images"),
-        ([*IMAGES, "--instances", "3"], "--instances has no effect with --images"),
     ],
 )
 def test_options_that_make_no_sense(options, message, tmp_path, capsys):
