@@ -73,7 +73,7 @@ class MeshObject:
         )
 
     def flipped(self, signs: Float[np.ndarray, " J"]) -> MeshObject:
-        """With the axes of the joints with sign -1 turned round, and their limits with them."""
+        """With the axes of the joints with sign -1 reversed, and their limits with them."""
         limits = np.where(signs[:, None] < 0, -self.limits[:, ::-1], self.limits)
         return MeshObject(
             self.parts, self.kinds, self.parents, self.axis * signs[:, None], self.pivot, limits

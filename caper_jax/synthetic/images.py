@@ -248,16 +248,16 @@ def _fit(key, corners: np.ndarray, intrinsics: np.ndarray, size: int) -> np.ndar
     x = np.array([z[2], 0.0, -z[0]]) / np.hypot(z[0], z[2])
     move = np.eye(4)
     move[:3, :3] = np.stack([x, np.cross(z, x), z])
-    turned = corners @ move[:3, :3].T
+    rotated = corners @ move[:3, :3].T
     # The object reaches to `half` on the plane z = 1 when it is `back` farther away.
     focal = np.array([intrinsics[0, 0], intrinsics[1, 1]])
     room = _FILL * np.minimum(intrinsics[:2, 2], size - intrinsics[:2, 2]) / focal
-    back = (np.abs(turned[:, :2]) / room).max(-1) - turned[:, 2]
-    nearest = 0.05 * np.linalg.norm(np.ptp(turned, axis=0)) - turned[:, 2].min()
+    back = (np.abs(rotated[:, :2]) / room).max(-1) - rotated[:, 2]
+    nearest = 0.05 * np.linalg.norm(np.ptp(rotated, axis=0)) - rotated[:, 2].min()
     move[2, 3] = max(back.max(), nearest, 0.0)
     # Somewhere in the room that is left.
-    depth = turned[:, 2] + move[2, 3]
-    slack = (room * depth[:, None] - np.abs(turned[:, :2])).min(0)
+    depth = rotated[:, 2] + move[2, 3]
+    slack = (room * depth[:, None] - np.abs(rotated[:, :2])).min(0)
     move[:2, 3] = rng.uniform(-1.0, 1.0, 2) * slack
     return move
 

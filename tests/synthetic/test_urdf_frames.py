@@ -13,11 +13,10 @@ pytest.importorskip("trimesh")
 pytest.importorskip("embreex")
 pytest.importorskip("yourdfpy")
 
-from _helpers.solid_meshes import part_mesh
+from _helpers.solid_meshes import mesh_object
 from _helpers.urdf_models import partnet_drawer, partnet_laptop
 from PIL import Image
 
-from caper_jax.articulation.mesh_object import MeshObject
 from caper_jax.categories.laptop import LAPTOP
 from caper_jax.cli import common, generate
 from caper_jax.data.readers import open_dataset
@@ -35,18 +34,14 @@ FRAMES, GRID, POINTS = 4, 40, 300
 
 def generated(model, category, name="it"):
     """A generated object as if imported."""
-    meshes = [part_mesh(solids) for solids in model.parts]
-    parts = tuple(Mesh(np.asarray(m.vertices, float), np.asarray(m.faces)) for m in meshes)
-    reference = MeshObject(
-        parts, category.joint_types, category.parents, model.axis, model.pivot, model.limits
-    )
-    boxes = np.array([mesh.bounds() for mesh in parts])
+    at_rest = mesh_object(model, category)
+    boxes = np.array([mesh.bounds() for mesh in at_rest.parts])
     size, center = np.ptp(boxes, axis=1), boxes.mean(1)
     joints = tuple(
         JointMap(f"j{j}", joint.type, 1.0, 0.0, (low, high), (low, high))
         for j, (joint, (low, high)) in enumerate(zip(category.joints, model.limits, strict=True))
     )
-    return ImportedObject(name, category, reference, size, center, joints, ())
+    return ImportedObject(name, category, at_rest, size, center, joints, ())
 
 
 @pytest.fixture(scope="module")

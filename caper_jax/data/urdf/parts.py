@@ -44,7 +44,7 @@ class PartTree:
       links: K tuples of link names, root first.
       joints: K - 1.
       locked: state of every joint of the file that moves there but not here.
-      notes: which joints were locked, for people.
+      notes: which joints were locked, a line each.
     """
 
     links: tuple[tuple[str, ...], ...]
@@ -306,11 +306,11 @@ def _cut(tree: _LinkTree, category: Category, root: str, kept: Sequence[UrdfJoin
     for piece in order:
         for joint in kept:
             ends = piece_of[joint.parent], piece_of[joint.child]
-            for here, there, turned in ((*ends, False), (*ends[::-1], True)):
+            for here, there, reversed_ in ((*ends, False), (*ends[::-1], True)):
                 if here == piece and there not in order:
                     order.append(there)
-                    joints[there] = (joint, here, turned)
-    # Parts in the order of the joints that were asked for; the tree must be the category's.
+                    joints[there] = (joint, here, reversed_)
+    # Parts in the order of the joints that are kept; the tree must be the category's.
     children = sorted(joints, key=lambda piece: kept.index(joints[piece][0]))
     parts = [piece_of[root], *children]
     part_joints = tuple(

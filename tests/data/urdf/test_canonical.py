@@ -12,7 +12,7 @@ pytest.importorskip("trimesh")
 pytest.importorskip("yourdfpy")
 
 import yourdfpy
-from _helpers.solid_meshes import part_mesh
+from _helpers.solid_meshes import mesh_object, part_mesh
 from _helpers.urdf_models import (
     DRAWER_LEVELS,
     DRAWER_SIZE,
@@ -25,7 +25,6 @@ from _helpers.urdf_models import (
 )
 
 from caper_jax import categories
-from caper_jax.articulation.mesh_object import MeshObject
 from caper_jax.categories.drawer import DRAWER
 from caper_jax.categories.laptop import LAPTOP
 from caper_jax.categories.robotarm import ROBOTARM
@@ -33,7 +32,7 @@ from caper_jax.data.urdf import ImportOptions
 from caper_jax.data.urdf.canonical import import_model, import_urdf
 from caper_jax.data.urdf.load import UrdfJoint, UrdfModel, read_urdf
 from caper_jax.data.urdf.parts import map_parts
-from caper_jax.geometry.meshes import Mesh, join
+from caper_jax.geometry.meshes import join
 from caper_jax.synthetic.instances import draw_instances
 from caper_jax.synthetic.urdf_export import write_urdf
 
@@ -184,12 +183,7 @@ def as_urdf(model, category, turn, state):
     """A generated object as a URDF would hold it: axes turned, modeled at a state."""
     pose = np.eye(4)
     pose[:3, :3] = turn
-    meshes = [part_mesh(solids) for solids in model.parts]
-    parts = tuple(Mesh(np.asarray(m.vertices, float), np.asarray(m.faces)) for m in meshes)
-    at_rest = MeshObject(
-        parts, category.joint_types, category.parents, model.axis, model.pivot, model.limits
-    )
-    there = at_rest.at(state).moved(pose)
+    there = mesh_object(model, category).at(state).moved(pose)
     # A link's frame sits on its joint, as in most files.
     places = np.concatenate([np.zeros((1, 3)), there.pivot])
     links = {}
