@@ -79,7 +79,7 @@ class JointMap:
             "file_joint": self.file_joint,
             "type": self.type,
             "unit": "rad" if self.type == "revolute" else "m",
-            "map": "state = factor * value + offset",
+            "map": "state = factor * value + offset; value = (state - offset) / factor",
             "factor": self.factor,
             "offset": self.offset,
             "file_limits": _finite(self.file_limits),
