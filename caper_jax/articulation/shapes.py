@@ -12,7 +12,7 @@ from jaxtyping import Float
 from caper_jax.articulation.category import Category, ObjectModel
 from caper_jax.errors import CaperError
 from caper_jax.geometry.boxes import rest_diagonal
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 
 # Splits never share an instance: each draws from its own family of seeds.
 SPLITS = {"train": 0, "val": 1, "test": 2}

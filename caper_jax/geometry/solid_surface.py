@@ -7,8 +7,7 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
-from caper_jax.geometry.solid_bounds import corners_after_cut
-from caper_jax.geometry.solids import Solid
+from caper_jax.geometry.solids import Solid, corners_after_cut
 
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 

@@ -18,8 +18,7 @@ from caper_jax.articulation.shapes import (
     draw_shapes,
     shape_statistics,
 )
-from caper_jax.geometry.solid_bounds import bounds
-from caper_jax.geometry.solids import TAPERED, Kind, Solid
+from caper_jax.geometry.solids import TAPERED, Kind, Solid, bounds
 
 
 @flax.struct.dataclass

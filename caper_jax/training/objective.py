@@ -24,9 +24,9 @@ from caper_jax.geometry.frames import (
 from caper_jax.geometry.raster_order import raster_order, to_raster_order
 from caper_jax.geometry.two_axis_rotation import rotation_from_directions
 from caper_jax.lie import se3, so3
-from caper_jax.models.increment import increment_numbers, increment_transform
 from caper_jax.models.layers import after
-from caper_jax.models.networks import PartsNetwork, RootNetwork
+from caper_jax.models.parts import PartsNetwork, increment_numbers, increment_transform, vote
+from caper_jax.models.root import RootNetwork
 from caper_jax.models.rotation_classes import (
     CUBE_ROTATIONS,
     HALF_TURNS,
@@ -34,7 +34,6 @@ from caper_jax.models.rotation_classes import (
     nearest_cube_rotation,
     rotate_pose,
 )
-from caper_jax.models.voting import vote
 from caper_jax.training import losses
 from caper_jax.training.eager_gradient import value_with_eager_gradient
 
@@ -127,9 +126,9 @@ class Objective:
         metrics["segmentation_accuracy"] = (found * known).sum() / jnp.maximum(known.sum(), 1.0)
         if self.network.rotation_classifier.width:
             parts_losses = {name: value * right for name, value in parts_losses.items()}
-            parts_losses["rotation_class"] = losses.rotation_class_loss(parts.turn, turn)
+            parts_losses["rotation_class"] = losses.rotation_class_loss(parts.rotation_class, turn)
             metrics["rotation_class"] = parts_losses["rotation_class"].mean()
-            metrics["rotation_class_accuracy"] = (parts.turn.argmax(-1) == turn).mean()
+            metrics["rotation_class_accuracy"] = (parts.rotation_class.argmax(-1) == turn).mean()
             reference = rotate_pose(reference, jnp.asarray(CUBE_ROTATIONS)[turn])
         increment_loss, off = self._increment_loss(parts.increment, reference, truth)
         parts_losses["twist"] = increment_loss

@@ -20,8 +20,8 @@ from caper_jax.estimator import estimate
 from caper_jax.geometry.frames import part_points
 from caper_jax.lie import so3
 from caper_jax.models import rotation_classes
-from caper_jax.models.networks import PartsNetwork, RootNetwork, quaternion_axes
-from caper_jax.models.voting import vote
+from caper_jax.models.parts import PartsNetwork, vote
+from caper_jax.models.root import RootNetwork, quaternion_axes
 from caper_jax.training.objective import Objective
 
 

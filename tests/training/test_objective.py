@@ -16,7 +16,8 @@ from caper_jax.articulation.symmetry import apply_symmetry
 from caper_jax.config import LossConfig, LossWeights
 from caper_jax.geometry.frames import view_rotation
 from caper_jax.lie import se3
-from caper_jax.models.networks import PartsOutput, RootOutput
+from caper_jax.models.parts import PartsOutput
+from caper_jax.models.root import RootOutput
 from caper_jax.training.objective import Objective
 
 # A door on a cabinet, and a drawer that slides in it.
@@ -69,7 +70,7 @@ class Oracle(Objective):
                 view @ pose.rotation[:, 0],
                 unit * (view * pose.translation[:, 0, None, :]).sum(-1),
             ),
-            turn=None,
+            rotation_class=None,
             segmentation=100.0 * jax.nn.one_hot(labels[:, ::stride], category.num_parts),
             heatmap=jnp.where(voting, jnp.exp(-distance), 0.0),
             offset=offset,

@@ -17,7 +17,7 @@ from caper_jax.articulation.urdf_rule import (
     along_positive,
     snap_state,
 )
-from caper_jax.categories import eyeglasses_front as fronts
+from caper_jax.categories.eyeglasses import front as fronts
 from caper_jax.categories.forms import about, beam, mirrored
 from caper_jax.geometry.solids import Solid, ellipsoid
 

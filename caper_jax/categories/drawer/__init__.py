@@ -19,9 +19,9 @@ from caper_jax.articulation.urdf_rule import (
     opening_sign,
     opens_along,
 )
-from caper_jax.categories import cabinet
-from caper_jax.categories.cabinet import Plan
-from caper_jax.categories.furniture import TURN_Y, Handle, HandleStyle, StandStyle, stand
+from caper_jax.categories.drawer import cabinet
+from caper_jax.categories.drawer.cabinet import Plan
+from caper_jax.categories.forms import TURN_Y, Handle, HandleStyle, StandStyle, stand
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid, frustum
 
 
