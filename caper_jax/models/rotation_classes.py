@@ -7,7 +7,6 @@ difference is easier to see, so stage II also says by which of them its referenc
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int

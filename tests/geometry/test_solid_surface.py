@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solids import bounds
 from caper_jax.geometry.solid_surface import surface_points
-from caper_jax.geometry.solids import Solid, box, cone, cylinder, ellipsoid, frustum
+from caper_jax.geometry.solids import Solid, bounds, box, cone, cylinder, ellipsoid, frustum
 from caper_jax.synthetic.instances import draw_instances
 
 KINDS = ("box", "cylinder", "ellipsoid", "frustum", "cone")
