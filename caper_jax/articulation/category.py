@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from caper_jax.articulation.urdf_rule import UrdfRule
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.geometry.solids import Solid
 
@@ -103,11 +104,15 @@ class Category:
       directions_reason: why these two.
       unit: network units per meter; inputs and outputs of the public interface are meters.
       mean_size: [K, 3] meters, mean part sizes of the training instances (paper Sec 5.2.3).
-      mean_center: [K, 3] meters, mean box centers in the rest-canonical frame.
+      mean_center: [K, 3] meters, mean box centers in the rest-canonical frame. Where this,
+        mean_size or unit is left out, it is computed from drawn shapes, which takes about a second.
       shape: draws an instance from a numpy generator; None when only real data exist.
       viewpoint: cameras of generated frames.
       symmetries: declared ambiguities.
       closed: the limit at which a joint is closed; None where that means nothing.
+      urdf_rule: how objects in URDF files become this category's; no rule takes the file's state 0
+        as the rest pose, z as up and x as the front.
+      artimage_id: its number in ArtImage's annotations, 0 where it has none.
     """
 
     name: str
@@ -115,13 +120,16 @@ class Category:
     joints: tuple[Joint, ...]
     directions: tuple[Literal["x", "y", "z"], Literal["x", "y", "z"]]
     directions_reason: str
-    unit: float
-    mean_size: tuple[tuple[float, float, float], ...]
-    mean_center: tuple[tuple[float, float, float], ...]
+    unit: float = 0.0
+    mean_size: tuple[tuple[float, float, float], ...] = ()
+    mean_center: tuple[tuple[float, float, float], ...] = ()
     shape: Callable[[np.random.Generator], ObjectModel] | None = None
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
     symmetries: tuple[Symmetry, ...] = ()
     closed: Literal["low", "high"] | None = "low"
+    # Compiled functions do not depend on it: it is no part of equality or of the hash.
+    urdf_rule: UrdfRule = field(default_factory=UrdfRule, compare=False)
+    artimage_id: int = 0
 
     @property
     def num_parts(self) -> int:
@@ -212,9 +220,17 @@ class Category:
             raise CaperError(f"{where}: directions are two of x, y, z, got {self.directions}")
         if self.directions[0] == self.directions[1]:
             raise CaperError(f"{where}: the two directions must differ, got {self.directions}")
+        if self.shape is not None and not (self.unit and self.mean_size and self.mean_center):
+            from caper_jax.articulation.shapes import left_out
+
+            for name, value in left_out(self).items():
+                object.__setattr__(self, name, value)
         for label, rows in (("mean_size", self.mean_size), ("mean_center", self.mean_center)):
             if np.shape(rows) != (len(self.parts), 3):
-                raise CaperError(f"{where}: {label} must be [{len(self.parts)}, 3]")
+                raise CaperError(
+                    f"{where}: {label} must be [{len(self.parts)}, 3]; only a category with a "
+                    "shape function may leave it out"
+                )
             if not np.isfinite(rows).all():
                 raise CaperError(f"{where}: {label} must be finite")
         if not 0 < self.unit < np.inf or np.min(self.mean_size) <= 0:

@@ -1,5 +1,7 @@
 """Joint transforms and forward kinematics of a part tree (paper Sec 5.2.2, Eq 8).
 
+Differentiable in JAX, and in float64 on the host for files.
+
 Eq 8 is implemented in its right form, ``[R | (I - R) q]``. A state is measured from the rest pose,
 in radians (revolute) or meters (prismatic). A positive one turns the child by plus the state about
 the axis, or slides it by plus the state along the axis. Axes are scaled to unit length here; a zero
@@ -13,7 +15,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.lie import se3, so3
@@ -143,3 +145,71 @@ def forward_kinematics(
     for joint, parent in enumerate(parents):
         poses.append(se3.compose(poses[parent], motions[..., joint, :, :]))
     return jnp.stack(jnp.broadcast_arrays(*poses), axis=-3)
+
+
+def joint_transform_float64(
+    joint_type: str,
+    axis: Float[np.ndarray, " 3"],
+    pivot: Float[np.ndarray, " 3"],
+    state: float,
+) -> Float[np.ndarray, "4 4"]:
+    """``joints.joint_transform`` of one joint with a unit axis, in float64 without JAX.
+
+    For files, whose meshes must not move by the rounding of float32.
+
+    Args:
+      joint_type: "revolute" or "prismatic".
+      axis: [3] unit vector.
+      pivot: [3] meters; without effect on a prismatic joint.
+      state: radians or meters.
+
+    Returns:
+      [4, 4].
+
+    Raises:
+      CaperError: unknown joint type.
+    """
+    from scipy.spatial.transform import Rotation  # importing it costs 0.1 s
+
+    motion = np.eye(4)
+    if joint_type == "prismatic":
+        motion[:3, 3] = state * axis
+    elif joint_type == "revolute":
+        motion[:3, :3] = Rotation.from_rotvec(state * axis).as_matrix()
+        motion[:3, 3] = pivot - motion[:3, :3] @ pivot
+    else:
+        raise unknown_name("joint type", joint_type, ("revolute", "prismatic"))
+    return motion
+
+
+def forward_kinematics_float64(
+    root: Float[np.ndarray, "4 4"],
+    axis: Float[np.ndarray, "J 3"],
+    pivot: Float[np.ndarray, "J 3"],
+    state: Shaped[np.ndarray, " J"],
+    joint_types: Sequence[str],
+    parents: Sequence[int],
+) -> Float[np.ndarray, "K 4 4"]:
+    """``forward_kinematics`` of one object with unit axes, in float64 without JAX.
+
+    Args:
+      root: [4, 4] pose of part 0.
+      axis: [J, 3] unit joint axes.
+      pivot: [J, 3] meters.
+      state: [J] radians or meters from the rest pose.
+      joint_types: J times "revolute" or "prismatic".
+      parents: J parent parts; a parent comes before its child.
+
+    Returns:
+      [K, 4, 4].
+
+    Raises:
+      CaperError: unknown joint type.
+    """
+    poses = [np.asarray(root, np.float64)]
+    for joint, parent in enumerate(parents):
+        motion = joint_transform_float64(
+            joint_types[joint], axis[joint], pivot[joint], float(state[joint])
+        )
+        poses.append(poses[parent] @ motion)
+    return np.stack(poses)

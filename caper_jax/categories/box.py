@@ -5,6 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry
+from caper_jax.articulation.urdf_rule import (
+    UrdfRule,
+    X,
+    closed_states,
+    hinged_axes,
+    opens_along,
+)
 from caper_jax.categories.forms import about
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid, frustum
 
@@ -288,5 +295,12 @@ BOX = Category(
             rotation=((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
             reason="a case whose lid is as deep as its base may exchange the two",
         ),
+    ),
+    urdf_rule=UrdfRule(
+        rest=closed_states,
+        axes=hinged_axes,
+        opening=opens_along(-X),
+        child_words=("lid", "cover"),
+        partnet_classes=("Box",),
     ),
 )

@@ -11,6 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.mesh_object import MeshObject
+from caper_jax.articulation.urdf_rule import (
+    CanonicalAxes,
+    UrdfRule,
+    X,
+    along_positive,
+    closed_states,
+    opening_sign,
+    opens_along,
+)
 from caper_jax.categories.forms import about, along, beam
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid
 
@@ -318,6 +328,31 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     return ObjectModel([handle, blade], _TRAVEL, mouth, limits)
 
 
+def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
+    """X where the blade goes, y out of the flat face, on the side of the slider.
+
+    The face is where the blade, with its slider, clearly stands out of the handle; of a cutter
+    without such a slider, the face across the handle's thin direction.
+    """
+    travel = ref.axis[0] * opening_sign(ref, 0)
+
+    def shift(direction: np.ndarray) -> float:
+        """Of the blade's middle from the handle's, as a share of the handle."""
+        handle, blade = (part.vertices @ direction for part in ref.parts)
+        apart = blade.max() + blade.min() - handle.max() - handle.min()
+        return float(apart / 2 / np.ptp(handle))
+
+    sides = [axis for axis in np.eye(3) if abs(axis @ travel) < 0.5]
+    up = max(sides, key=lambda direction: abs(shift(direction)))
+    if abs(shift(up)) < 0.24:
+        across = np.eye(3) - np.outer(travel, travel)
+        second = across @ ref.parts[0].moments()[2] @ across
+        # The travel itself has the value 0; the thin direction comes next.
+        up = np.linalg.eigh(second)[1][:, 1]
+    up = up * np.sign(shift(up)) if abs(shift(up)) > 0.05 else along_positive(up)
+    return CanonicalAxes(up, np.cross(travel, up))
+
+
 CUTTER = Category(
     name="cutter",
     parts=("body", "blade"),
@@ -328,4 +363,10 @@ CUTTER = Category(
     mean_size=((0.141, 0.015, 0.029), (0.114, 0.013, 0.017)),
     mean_center=((0.0, -0.002, 0.0), (0.012, 0.003, 0.0)),
     shape=shape,
+    urdf_rule=UrdfRule(
+        rest=closed_states,
+        axes=_urdf_axes,
+        opening=opens_along(X),
+        partnet_classes=("Knife",),
+    ),
 )

@@ -19,6 +19,7 @@ import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry, Viewpoint
 from caper_jax.categories.forms import about, beam, chain, mirrored, rotated
+from caper_jax.categories.scissors_urdf import URDF_RULE
 from caper_jax.geometry.solids import Solid, box, cylinder
 
 _Y = np.array([0.0, 1.0, 0.0])
@@ -350,4 +351,6 @@ SCISSORS = Category(
             tolerance=0.05,
         ),
     ),
+    urdf_rule=URDF_RULE,
+    artimage_id=5,
 )

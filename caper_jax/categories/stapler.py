@@ -10,6 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.urdf_rule import (
+    UrdfRule,
+    X,
+    closed_states,
+    hinged_axes,
+    opens_along,
+)
 from caper_jax.categories.forms import about, beam, rotated
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid
 
@@ -339,4 +346,10 @@ STAPLER = Category(
     mean_size=((0.04, 0.028, 0.176), (0.03, 0.031, 0.175)),
     mean_center=((0.0, -0.008, -0.002), (0.0, 0.006, 0.0)),
     shape=shape,
+    urdf_rule=UrdfRule(
+        rest=closed_states,
+        axes=hinged_axes,
+        opening=opens_along(-X),
+        partnet_classes=("Stapler",),
+    ),
 )

@@ -166,8 +166,8 @@ def _write_images(arguments: argparse.Namespace) -> None:
 
     from caper_jax import categories
     from caper_jax.progress import progress
+    from caper_jax.synthetic.images import render_image, write_frame
     from caper_jax.synthetic.instances import build_bank, draw_instances, split_key
-    from caper_jax.synthetic.render import render_image, write_frame
 
     category = categories.get(arguments.category)
     common.check_folder(arguments.out, "--out")
@@ -228,8 +228,7 @@ def _write_file(arguments: argparse.Namespace) -> None:
 
 def _draw_frames(category: Category, config: GeneratorConfig, arguments: argparse.Namespace):
     """Single frames: what ``hdf5.write`` is to be given, and nothing more to say."""
-    from caper_jax.synthetic.collect import collect_frames
-    from caper_jax.synthetic.frames import Generator
+    from caper_jax.synthetic.frames import Generator, collect_frames
 
     generator = Generator(category, config, arguments.split, arguments.seed)
     return collect_frames(generator, arguments.seed, arguments.frames), {}
@@ -237,9 +236,8 @@ def _draw_frames(category: Category, config: GeneratorConfig, arguments: argpars
 
 def _draw_videos(category: Category, config: GeneratorConfig, arguments: argparse.Namespace):
     """Videos one after the other: what ``hdf5.write`` is to be given, and the mode."""
-    from caper_jax.synthetic.collect import collect_videos
     from caper_jax.synthetic.videos import FRAMES as LENGTH
-    from caper_jax.synthetic.videos import VideoGenerator
+    from caper_jax.synthetic.videos import VideoGenerator, collect_videos
 
     mode, length = arguments.mode or "paper", arguments.frames_per_video or LENGTH
     generator = VideoGenerator(category, config, mode, length, arguments.split, arguments.seed)

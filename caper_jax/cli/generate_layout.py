@@ -40,10 +40,10 @@ def write_layout(arguments: argparse.Namespace) -> None:
     from caper_jax import categories
     from caper_jax.progress import progress
     from caper_jax.synthetic.artimage_writer import LayoutWriter
+    from caper_jax.synthetic.images import render_clip, render_still
     from caper_jax.synthetic.instances import build_bank, draw_instances, split_key
     from caper_jax.synthetic.videos import FRAMES as FRAMES_PER_VIDEO
     from caper_jax.synthetic.videos import check_length
-    from caper_jax.synthetic.views import clip, still
 
     videos = arguments.layout == "pm-videos"
     if videos and not arguments.videos:
@@ -75,9 +75,9 @@ def write_layout(arguments: argparse.Namespace) -> None:
             shown = (frame_key, instance, category, arguments.noise, intrinsics, SIZE)
             if videos:
                 moving = index % category.num_joints
-                writer.add_video(first + which, clip(*shown, length, moving), moving + 1)
+                writer.add_video(first + which, render_clip(*shown, length, moving), moving + 1)
             else:
-                writer.add_frame(first + which, still(*shown))
+                writer.add_frame(first + which, render_still(*shown))
             bar.update(1)
     writer.close()
     kind = "videos" if videos else "frames"

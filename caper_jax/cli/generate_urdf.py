@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ from caper_jax.errors import CaperError
 
 if TYPE_CHECKING:
     from caper_jax.articulation.category import Category
-    from caper_jax.data.urdf.canonical import ImportedObject, ImportOptions
+    from caper_jax.data.urdf import ImportedObject, ImportOptions
 
 _OPTIONS = ("up", "front", "rest", "parts", "scale")
 
@@ -23,7 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         "objects from URDF files",
         "How a file is understood is drawn to <out>_check/NAME.png and written to NAME.txt: look\n"
-        "at them, and correct with these options what was not detected rightly.",
+        "at them, and correct with these options what was not detected rightly. NAME.json has the\n"
+        "map from the file's joint values to states and back.",
     )
     group.add_argument(
         "--urdf",
@@ -121,7 +123,7 @@ def write_urdf_frames(arguments: argparse.Namespace) -> None:
 
     from caper_jax import __version__, categories
     from caper_jax.data import hdf5
-    from caper_jax.data.urdf.canonical import ImportOptions
+    from caper_jax.data.urdf import ImportOptions
     from caper_jax.progress import progress
     from caper_jax.synthetic.urdf_frames import render_frames
     from caper_jax.visualization.model_check import write_model_check
@@ -140,6 +142,8 @@ def write_urdf_frames(arguments: argparse.Namespace) -> None:
     for item in objects:
         write_model_check(check / f"{item.name}.png", item)
         (check / f"{item.name}.txt").write_text("\n".join(item.notes) + "\n", encoding="utf-8")
+        report = json.dumps(item.report(), indent=1) + "\n"
+        (check / f"{item.name}.json").write_text(report, encoding="utf-8")
     if len(objects) == 1:
         print("\n".join(objects[0].notes))
     with progress("rendering", total=arguments.frames) as bar:
@@ -183,7 +187,7 @@ def _import_all(path: Path, category: Category, options: ImportOptions) -> list[
     from dataclasses import replace
 
     from caper_jax.data.urdf.canonical import import_urdf
-    from caper_jax.data.urdf.folders import find_models
+    from caper_jax.data.urdf.load import find_models
 
     files = find_models(path)
     objects, first = [], None

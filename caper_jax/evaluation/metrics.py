@@ -136,9 +136,8 @@ def pose_errors_up_to_symmetry(
 
 def object_diagonal(pose: ArticulatedPose) -> Float[np.ndarray, " frames"]:
     """[F] meters, diagonal of the box around all parts at rest."""
-    half = np.asarray(pose.size, np.float64) / 2
-    center = np.asarray(pose.box_center, np.float64)
-    return np.linalg.norm((center + half).max(-2) - (center - half).min(-2), axis=-1)
+    size, center = (np.asarray(values, np.float64) for values in (pose.size, pose.box_center))
+    return boxes.rest_diagonal(size, center)
 
 
 @jax.jit

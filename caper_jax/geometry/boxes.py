@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -69,6 +70,24 @@ def corners(
     signs = np.array(list(itertools.product((-0.5, 0.5), repeat=3)), dtype=size.dtype)
     local = center[..., None, :] + signs * size[..., None, :]
     return apply(rotation[..., None, :, :], local) + translation[..., None, :]
+
+
+def rest_diagonal(
+    size: Float[Any, "*batch K 3"], center: Float[Any, "*batch K 3"]
+) -> Float[Any, "*batch"]:
+    """Diagonal [...] of the axis-aligned box around all parts of an object at rest.
+
+    Args:
+      size: [..., K, 3] full extents of the parts' boxes, any unit.
+      center: [..., K, 3] their centers, same unit.
+
+    Returns:
+      [...], a numpy array where both are, in their own precision.
+    """
+    numpy = isinstance(size, np.ndarray) and isinstance(center, np.ndarray)
+    low = (center - size / 2).min(-2)
+    high = (center + size / 2).max(-2)
+    return (np if numpy else jnp).linalg.norm(high - low, axis=-1)
 
 
 def iou_size(size_a: ArrayLike, size_b: ArrayLike) -> Float[Array, "..."]:

@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+
+
+def _cube_rotations() -> np.ndarray:
+    """[24, 3, 3] signed permutation matrices of determinant one, the identity first."""
+    found = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.eye(3)[list(order)] * np.array(signs)[:, None]
+            if np.linalg.det(matrix) > 0:
+                found.append(matrix)
+    return np.stack(found).astype(np.float32)
+
+
+# The rotations that map the coordinate axes onto each other.
+CUBE_ROTATIONS = _cube_rotations()
 
 
 def rotate(

@@ -7,28 +7,13 @@ difference is easier to see, so stage II also says by which of them its referenc
 
 from __future__ import annotations
 
-import itertools
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from caper_jax.geometry.frames import multiply
+from caper_jax.geometry.frames import CUBE_ROTATIONS, multiply
 from caper_jax.lie import se3
 
-
-def _rotations() -> np.ndarray:
-    """[24, 3, 3] signed permutation matrices of determinant one, the identity first."""
-    rotations = []
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            matrix = np.eye(3)[list(order)] * np.array(signs)[:, None]
-            if np.linalg.det(matrix) > 0:
-                rotations.append(matrix)
-    return np.stack(rotations).astype(np.float32)
-
-
-CUBE_ROTATIONS = _rotations()
 NUM_CUBE_ROTATIONS = len(CUBE_ROTATIONS)
 # Half turns about x, y and z: what rectangular objects are mistaken for.
 HALF_TURNS = tuple(

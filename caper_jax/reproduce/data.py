@@ -24,10 +24,9 @@ from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load, shipped_weights
 from caper_jax.models.files import CARD_FILE, read_card
 from caper_jax.reproduce.options import SPLIT, Options
-from caper_jax.synthetic.collect import collect_frames, collect_videos
-from caper_jax.synthetic.frames import Generator
+from caper_jax.synthetic.frames import Generator, collect_frames
 from caper_jax.synthetic.instances import InstanceBank
-from caper_jax.synthetic.videos import MODES, VideoGenerator
+from caper_jax.synthetic.videos import MODES, VideoGenerator, collect_videos
 
 NO_MODEL = "no model"
 NO_DATA = "no data"

@@ -23,12 +23,10 @@ from caper_jax.data.images import read_json
 from caper_jax.data.readers.artimage_models import POINTS, REST_STATES
 from caper_jax.data.readers.public_urdf import ALIGNED, POINT_ORDER, RAW
 from caper_jax.errors import CaperError
+from caper_jax.geometry.solid_surface import surface_points
 from caper_jax.geometry.solids import bounds
-from caper_jax.synthetic.render import Image
-from caper_jax.synthetic.surface import surface_points
+from caper_jax.synthetic.images import Image
 
-SPLITS = ("train", "val", "test")
-_NUMBERS = {"laptop": 1, "eyeglasses": 2, "dishwasher": 3, "drawer": 4, "scissors": 5}
 _POINTS_PER_PART = 2048
 _BACKGROUND = 255
 # Our coordinates in the order of the URDF.
@@ -160,7 +158,7 @@ class LayoutWriter:
         height, width = depth.shape
         instance = {
             "id": 1,
-            "category_id": _NUMBERS.get(self.category.name, 0),
+            "category_id": self.category.artimage_id,
             "urdf_id": urdf_id,
             "bbox": [int(value) for value in box],
             "links": self._links(image),

@@ -8,6 +8,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from caper_jax.articulation.category import Viewpoint
 
@@ -24,20 +25,20 @@ class Camera:
       azimuth, elevation, roll: radians, see ``Viewpoint``.
       log_distance: natural logarithm of the distance in object diagonals.
       target: [3] the point aimed at, canonical frame, in object diagonals.
-      aside: [2] where the target stands in the image, on the plane z = 1.
+      image_offset: [2] where the target stands in the image, on the plane z = 1.
       side: 1, or -1 where the object lies upside down: ``Viewpoint.up`` points into the table.
     """
 
-    azimuth: Any
-    elevation: Any
-    roll: Any
-    log_distance: Any
-    target: Any
-    aside: Any
-    side: Any
+    azimuth: Float[Any, "*batch"]
+    elevation: Float[Any, "*batch"]
+    roll: Float[Any, "*batch"]
+    log_distance: Float[Any, "*batch"]
+    target: Float[Any, "*batch 3"]
+    image_offset: Float[Any, "*batch 2"]
+    side: Float[Any, "*batch"]
 
 
-def draw_camera(key, view: Viewpoint) -> Camera:
+def draw_camera(key: PRNGKeyArray, view: Viewpoint) -> Camera:
     """A camera in the ranges that the conventions ask for."""
     # One draw for all: every call of jax.random costs compile time.
     uniform = jax.random.uniform(key, (10,))
@@ -49,7 +50,7 @@ def draw_camera(key, view: Viewpoint) -> Camera:
     nearest, farthest = np.log(view.distance)
     # The object stands anywhere in the image. 0.55 and 0.35 are the half widths of a 58 x 39 deg
     # field of view at z = 1; wide cameras reach 1.2 times that.
-    aside = (2.0 * uniform[7:9] - 1.0) * jnp.array([0.55, 0.35]) * 1.2 * uniform[9]
+    image_offset = (2.0 * uniform[7:9] - 1.0) * jnp.array([0.55, 0.35]) * 1.2 * uniform[9]
     side = jnp.ones(())
     if view.either_side:
         side = jax.random.rademacher(jax.random.fold_in(key, 1), (), side.dtype)
@@ -59,12 +60,18 @@ def draw_camera(key, view: Viewpoint) -> Camera:
         roll=roll,
         log_distance=nearest + uniform[3] * (farthest - nearest),
         target=(uniform[4:7] - 0.5) * 0.1,
-        aside=aside,
+        image_offset=image_offset,
         side=side,
     )
 
 
-def camera_arc(key, camera: Camera, view: Viewpoint, frames: int, speed) -> Camera:
+def camera_arc(
+    key: PRNGKeyArray,
+    camera: Camera,
+    view: Viewpoint,
+    frames: int,
+    speed: float | Float[Array, ""],
+) -> Camera:
     """A smooth arc that starts at ``camera``: every value changes by equal steps.
 
     Over the clip and at speed 1 the azimuth changes by up to 34 deg, elevation and roll by 9 deg
@@ -104,12 +111,14 @@ def camera_arc(key, camera: Camera, view: Viewpoint, frames: int, speed) -> Came
         roll=path[2],
         log_distance=path[3],
         target=jnp.broadcast_to(camera.target, (frames, 3)),
-        aside=jnp.broadcast_to(camera.aside, (frames, 2)),
+        image_offset=jnp.broadcast_to(camera.image_offset, (frames, 2)),
         side=jnp.broadcast_to(camera.side, (frames,)),
     )
 
 
-def camera_pose(camera: Camera, view: Viewpoint, diagonal):
+def camera_pose(
+    camera: Camera, view: Viewpoint, diagonal: float | Float[Any, ""]
+) -> Float[Array, "4 4"]:
     """Pose [4, 4] root canonical -> camera (OpenCV axes) of a camera without leading axes.
 
     Args:
@@ -127,8 +136,8 @@ def camera_pose(camera: Camera, view: Viewpoint, diagonal):
     pose = _look_at(eye, camera.target * diagonal, up, camera.roll)
     # Turn the camera away from the object, keeping its place; less so at close range, where the
     # whole object must stay in front of it.
-    aside = camera.aside * jnp.minimum(1.0, distance / (3.0 * diagonal))
-    return jnp.matmul(_aside(aside), pose, precision="highest")
+    image_offset = camera.image_offset * jnp.minimum(1.0, distance / (3.0 * diagonal))
+    return jnp.matmul(_turn_aside(image_offset), pose, precision="highest")
 
 
 def _look_at(eye, target, up, roll):
@@ -144,7 +153,7 @@ def _look_at(eye, target, up, roll):
     return jnp.eye(4).at[:3, :3].set(rotation).at[:3, 3].set(translation)
 
 
-def _aside(offset):
+def _turn_aside(offset):
     """The shortest rotation [4, 4] that takes the optical axis to (offset, 1)."""
     direction = jnp.array([offset[0], offset[1], 1.0])
     direction /= jnp.linalg.norm(direction)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,19 +10,23 @@ from typing import Any, NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.config import GeneratorConfig
+from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.geometry.raster_order import grid_raster_order
+from caper_jax.progress import progress
 from caper_jax.synthetic import masks
 from caper_jax.synthetic import sensor as sensors
 from caper_jax.synthetic.camera import camera_pose, draw_camera
-from caper_jax.synthetic.instances import InstanceBank, build_bank, draw_instances
+from caper_jax.synthetic.instances import InstanceBank, build_bank, draw_instances, split_key
 from caper_jax.synthetic.ray_casting import FAR, nearest_part, part_depths, projected_bounds
-from caper_jax.synthetic.surroundings import add_clutter, spill_on_table, table_depth
 
+FRAMES_AT_A_TIME = 25  # what the frames of a seed are depends on it
 _MARGIN = 0.04  # of the object's projected box, on each side
 
 
@@ -39,15 +44,15 @@ class Batch:
         another part nor something else, were in front of it; None unless measured.
     """
 
-    points: Any
-    labels: Any
+    points: Float[Any, "*B N 3"]
+    labels: Int[Any, "*B N"]
     pose: ArticulatedPose
-    visible: Any
+    visible: Int[Any, "*B K"]
     instance: Any
-    visibility: Any = None
+    visibility: Float[Any, "*B K"] | None = None
 
 
-def systematic(key, hit, count: int):
+def systematic_sample(key: PRNGKeyArray, hit: Bool[Array, "G G"], count: int) -> Int[Array, " N"]:
     """Raster indices [count] of hits [G, G], evenly spread in scan order; repeating if too few.
 
     The r-th pick is hit number floor((r + u) n / count): no sort, uniform over the image.
@@ -63,7 +68,9 @@ def systematic(key, hit, count: int):
     return order[place]
 
 
-def draw_state_and_poses(key, instance: InstanceBank, category: Category):
+def draw_state_and_poses(
+    key: PRNGKeyArray, instance: InstanceBank, category: Category
+) -> tuple[Float[Array, " J"], Float[Array, "K 4 4"], Float[Any, ""]]:
     """Joint states over the instance's range, and a camera around it.
 
     Returns:
@@ -72,20 +79,18 @@ def draw_state_and_poses(key, instance: InstanceBank, category: Category):
     state_key, camera_key = jax.random.split(key)
     low, high = instance.limits[:, 0], instance.limits[:, 1]
     state = low + jax.random.uniform(state_key, low.shape) * (high - low)
-    diagonal = rest_diagonal(instance)
+    diagonal = rest_diagonal(instance.size, instance.box_center)
     view = category.viewpoint
     root = camera_pose(draw_camera(camera_key, view), view, diagonal)
     return state, part_poses(root, instance, state, category), diagonal
 
 
-def rest_diagonal(instance: InstanceBank):
-    """Diagonal of the whole object's box at rest, meters."""
-    low = (instance.box_center - instance.size / 2).min(0)
-    high = (instance.box_center + instance.size / 2).max(0)
-    return jnp.linalg.norm(high - low)
-
-
-def part_poses(root, instance: InstanceBank, state, category: Category):
+def part_poses(
+    root: Float[Any, "*batch 4 4"],
+    instance: InstanceBank,
+    state: Float[Any, "*states J"],
+    category: Category,
+) -> Float[Array, "*states K 4 4"]:
     """Poses [..., K, 4, 4] of all parts from the root's [..., 4, 4] and the states [..., J]."""
     return forward_kinematics(
         root,
@@ -97,40 +102,59 @@ def part_poses(root, instance: InstanceBank, state, category: Category):
     )
 
 
-class Keys(NamedTuple):
+def articulated_pose(
+    instance: InstanceBank, state: Float[Any, "*batch J"], poses: Float[Any, "*batch K 4 4"]
+) -> ArticulatedPose:
+    """Ground truth of instances in given states and poses of their parts."""
+    return ArticulatedPose(
+        rotation=poses[..., :3, :3],
+        translation=poses[..., :3, 3],
+        size=instance.size,
+        box_center=instance.box_center,
+        joint_axis=instance.joint_axis,
+        joint_pivot=instance.joint_pivot,
+        joint_state=state,
+    )
+
+
+class FrameKeys(NamedTuple):
     """PRNG keys of a frame; a video keeps some of them from frame to frame."""
 
-    scene: Any
-    grid: Any
-    mask: Any
-    sensor: Any
-    loss: Any
-    pick: Any
-    noise: Any
-    residue: Any
+    scene: PRNGKeyArray
+    grid: PRNGKeyArray
+    mask: PRNGKeyArray
+    sensor: PRNGKeyArray
+    loss: PRNGKeyArray
+    pick: PRNGKeyArray
+    noise: PRNGKeyArray
+    residue: PRNGKeyArray
 
 
 def render_frame(
-    key, instance: InstanceBank, category: Category, config: GeneratorConfig, mix
+    key: PRNGKeyArray,
+    instance: InstanceBank,
+    category: Category,
+    config: GeneratorConfig,
+    mix: sensors.Sensor,
 ) -> Batch:
     """One labeled frame of one instance (InstanceBank without its leading axis).
 
     Returns:
       Batch without its leading axis; ``instance`` is None.
     """
-    keys = Keys(*jax.random.split(key, 8))
+    keys = FrameKeys(*jax.random.split(key, 8))
     state, poses, _ = draw_state_and_poses(keys.scene, instance, category)
     return observe(keys, instance, state, poses, category, config, mix)
 
 
 def observe(
-    keys: Keys,
+    keys: FrameKeys,
     instance: InstanceBank,
-    state,
-    poses,
+    state: Float[Any, " J"],
+    poses: Float[Any, "K 4 4"],
     category: Category,
     config: GeneratorConfig,
-    mix,
+    mix: sensors.Sensor,
 ) -> Batch:
     """What a depth camera and a mask show of one instance in a given pose.
 
@@ -156,34 +180,27 @@ def observe(
     if config.measure_visibility:
         visibility = visible / jnp.maximum((alone < FAR).sum(axis=1), 1)
 
-    sensor = sensors.draw(keys.sensor, mix)
-    surface = sensors.surface(depth, hit, rays)
-    seen = sensors.lose(keys.loss, sensor, surface, hit)
+    sensor = sensors.draw_sensor(keys.sensor, mix)
+    surface = sensors.surface_map(depth, hit, rays)
+    seen = sensors.valid_pixels(keys.loss, sensor, surface, hit)
     if config.dropout > 0 or config.holes > 0:
-        lost = masks.drop(jax.random.fold_in(keys.loss, 1), hit, config.dropout, config.holes)
+        lost_key = jax.random.fold_in(keys.loss, 1)
+        lost = masks.missing_depth(lost_key, hit, config.dropout, config.holes)
         seen = masks.keep_most(seen & ~lost, seen)
     seen = jnp.where(seen.any(), seen, hit)
 
     # Only the chosen pixels are measured: random numbers are what costs on a CPU.
-    index = systematic(keys.pick, seen, config.num_points)
+    index = systematic_sample(keys.pick, seen, config.num_points)
     chosen = jax.tree.map(lambda image: image.ravel()[index], surface)
     points = sensors.measure(keys.noise, sensor, chosen, (flat[0][index], flat[1][index]))
     labels = part.ravel()[index]
     if config.residue > 0:
-        diagonal = rest_diagonal(instance)
+        diagonal = rest_diagonal(instance.size, instance.box_center)
         points, labels = _add_residue(keys.residue, points, labels, diagonal, config.residue)
     if config.depth_scale > 0:
         error = jax.random.normal(jax.random.fold_in(keys.sensor, 1))
         points *= 1.0 + config.depth_scale * jnp.clip(error, -3.0, 3.0)
-    pose = ArticulatedPose(
-        rotation=poses[:, :3, :3],
-        translation=poses[:, :3, 3],
-        size=instance.size,
-        box_center=instance.box_center,
-        joint_axis=instance.joint_axis,
-        joint_pivot=instance.joint_pivot,
-        joint_state=state,
-    )
+    pose = articulated_pose(instance, state, poses)
     return Batch(points, labels, pose, visible, None, visibility)
 
 
@@ -215,9 +232,9 @@ def _apply_mask(
     if config.occlusion > 0:
         hit = masks.occlude(key, hit, config.occlusion, config.occluders)
     if config.table > 0 or config.clutter > 0:
-        table = table_depth(instance, poses, category.viewpoint, rays)
+        table = masks.table_depth(instance, poses, category.viewpoint, rays)
     if config.table > 0:
-        depth, hit = spill_on_table(
+        depth, hit = masks.spill_on_table(
             jax.random.fold_in(key, 3), depth, part, hit, table, config.table, config.spill
         )
     if config.erosion > 0:
@@ -225,13 +242,13 @@ def _apply_mask(
         # A mask that takes in the table is not too tight.
         hit = jnp.where((hit & (part < 0)).any(), hit, eroded)
     if config.clutter > 0:
-        depth, part, hit = add_clutter(
+        depth, part, hit = masks.add_clutter(
             jax.random.fold_in(key, 4),
             depth,
             part,
             hit,
             table,
-            rest_diagonal(instance),
+            rest_diagonal(instance.size, instance.box_center),
             rays,
             config.clutter,
             config.spill,
@@ -274,7 +291,7 @@ class Generator:
         # The bank is an argument: as a constant it would go through the compiler.
         self._batch = jax.jit(self.draw, static_argnames="batch_size")
 
-    def draw(self, key, batch_size: int, bank: InstanceBank | None = None) -> Batch:
+    def draw(self, key: PRNGKeyArray, batch_size: int, bank: InstanceBank | None = None) -> Batch:
         """Traceable form of ``batch``: call it inside a larger jitted function."""
         bank = self.bank if bank is None else bank
         pick, rest = jax.random.split(key)
@@ -284,7 +301,7 @@ class Generator:
         frames = jax.vmap(frame)(jax.random.split(rest, batch_size), instances)
         return replace(frames, instance=index)
 
-    def batch(self, key, batch_size: int) -> Batch:
+    def batch(self, key: PRNGKeyArray, batch_size: int) -> Batch:
         """A batch of frames; the same key gives the same batch.
 
         Args:
@@ -292,3 +309,47 @@ class Generator:
           batch_size: B.
         """
         return self._batch(key, batch_size=batch_size, bank=self.bank)
+
+
+def collect(
+    draw: Callable[[PRNGKeyArray, int], Batch],
+    key: PRNGKeyArray,
+    total: int,
+    size: int,
+    title: str = "generating",
+) -> Batch:
+    """``total`` frames or videos as numpy arrays.
+
+    Args:
+      draw: (key, count) -> Batch, e.g. ``Generator.batch``.
+      key: PRNG key, into which the number of each draw's first frame is folded.
+      total: how many.
+      size: drawn at a time; the same key and size give the same frames.
+      title: of the progress display.
+    """
+    parts = []
+    with progress(title, total=total) as bar:
+        for start in range(0, total, size):
+            count = min(size, total - start)
+            batch = draw(jax.random.fold_in(key, start), size)
+            parts.append(jax.tree.map(lambda array, n=count: np.asarray(array)[:n], batch))
+            bar.update(count)
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
+
+
+def collect_frames(
+    generator: Generator, seed: int, frames: int, title: str = "generating"
+) -> dict[str, Any]:
+    """Single frames as the arguments of ``hdf5.write`` that they decide.
+
+    Args:
+      generator: draws them, of its split.
+      seed: of the split's key, see ``split_key``.
+      title: see ``collect``.
+      frames: how many.
+    """
+    key = split_key(generator.split, seed)
+    batch = collect(generator.batch, key, frames, FRAMES_AT_A_TIME, title)
+    prefix = f"{generator.category.name}_{generator.split}"
+    names = [f"{prefix}{instance:04d}_{index:06d}" for index, instance in enumerate(batch.instance)]
+    return {**vars(batch), "names": names}

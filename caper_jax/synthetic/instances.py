@@ -9,13 +9,16 @@ from typing import Any
 import flax.struct
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, PRNGKeyArray
 
 from caper_jax.articulation.category import Category, ObjectModel
-from caper_jax.errors import CaperError
+from caper_jax.articulation.shapes import (
+    centered,
+    check_declared,
+    draw_shapes,
+    shape_statistics,
+)
 from caper_jax.geometry.solids import TAPERED, Kind, Solid, bounds
-
-# Splits never share an instance: each draws from its own family of seeds.
-SPLITS = {"train": 0, "val": 1, "test": 2}
 
 
 @flax.struct.dataclass
@@ -34,10 +37,10 @@ class SolidGroup:
       hole: kind of the solid cut away, or None.
     """
 
-    to_unit: Any
-    center: Any
-    half_axes: Any
-    valid: Any
+    to_unit: Float[Any, "*n M 3 3"]
+    center: Float[Any, "*n M 3"]
+    half_axes: Float[Any, "*n M 3 3"]
+    valid: Bool[Any, "*n M"]
     taper: Any
     hole_to_unit: Any
     hole_center: Any
@@ -59,11 +62,11 @@ class InstanceBank:
     """
 
     groups: dict[str, SolidGroup]
-    joint_axis: Any
-    joint_pivot: Any
-    limits: Any
-    size: Any
-    box_center: Any
+    joint_axis: Float[Any, "*n J 3"]
+    joint_pivot: Float[Any, "*n J 3"]
+    limits: Float[Any, "*n J 2"]
+    size: Float[Any, "*n K 3"]
+    box_center: Float[Any, "*n K 3"]
 
     @property
     def num_instances(self) -> int:
@@ -74,32 +77,38 @@ def _group_name(solid: Solid) -> str:
     return solid.kind if solid.hole is None else f"{solid.kind}-{solid.hole.kind}"
 
 
-def centered(model: ObjectModel) -> ObjectModel:
-    """The model with its origin at the center of the whole object's box at rest."""
-    low, high = bounds([solid for part in model.parts for solid in part])
-    offset = -(low + high) / 2
-    parts = [[solid.moved(offset) for solid in part] for part in model.parts]
-    return ObjectModel(parts, model.axis, model.pivot + offset, model.limits)
-
-
 def draw_instances(category: Category, count: int, split: str, seed: int) -> list[ObjectModel]:
     """``count`` instances of a category; other splits and seeds give other instances.
 
     Raises:
-      CaperError: unknown split, or a category without a procedural shape.
+      CaperError: unknown split, a category without a procedural shape, or one whose shapes are not
+        what it declares: parts, joints, unit axes, sizes, unit.
     """
-    if split not in SPLITS:
-        raise CaperError(f"unknown split {split!r} (known: {', '.join(SPLITS)})")
-    if category.shape is None:
-        raise CaperError(f"category {category.name!r} has no procedural shape to generate from")
-    # The name enters the seed so that categories do not share their random streams.
-    root = [zlib.crc32(category.name.encode()), SPLITS[split], seed]
-    return [
-        centered(category.shape(np.random.default_rng([*root, index]))) for index in range(count)
-    ]
+    models = draw_shapes(category, count, split, seed)
+    check_declared(category, models)
+    return [centered(model) for model in models]
 
 
-def split_key(split: str, seed: int):
+def statistics(category: Category, count: int = 1500, seed: int = 0) -> dict[str, Any]:
+    """What a category's shape function draws on average.
+
+    Args:
+      category: with a shape function.
+      count: instances of the training split.
+      seed: of their draws.
+
+    Returns:
+      "unit" (network units per meter at which the mean diagonal is 2), "mean_size" and
+      "mean_center" (K rows of x, y, z; meters), "mean_diagonal" (meters).
+
+    Raises:
+      CaperError: a category without a procedural shape, or shapes that are not its instances.
+    """
+    drawn = shape_statistics(draw_shapes(category, count, "train", seed))
+    return {name: np.asarray(value).tolist() for name, value in drawn._asdict().items()}
+
+
+def split_key(split: str, seed: int) -> PRNGKeyArray:
     """PRNG key of the frames of a split: cameras, states, sensors and which instances they show.
 
     "test" has the plain key of the seed, for the published figures rest on its frames; the others

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from caper_jax.geometry.solids import Kind
 
@@ -25,17 +26,19 @@ LIMIT = 1e9  # an inverse depth that no surface reaches
 _TINY = 1e-30
 
 
-def matvec(matrix, vector):
+def matvec(
+    matrix: Float[Array, "*#batch 3 3"], vector: Float[Array, "*#batch 3"]
+) -> Float[Array, " ..."]:
     """[..., 3, 3] @ [..., 3] elementwise: exact in float32 on every backend (no TF32)."""
     return (matrix * vector[..., None, :]).sum(-1)
 
 
-def larger(a, b):
+def larger(a: Float[Any, " ..."] | float, b: Float[Any, " ..."] | float) -> Float[Array, " ..."]:
     """jnp.maximum without its care for NaN, which makes the caster half as slow again on a CPU."""
     return jnp.where(a > b, a, b)
 
 
-def smaller(a, b):
+def smaller(a: Float[Any, " ..."] | float, b: Float[Any, " ..."] | float) -> Float[Array, " ..."]:
     return jnp.where(a < b, a, b)
 
 
@@ -53,7 +56,7 @@ def _rate(form, rays):
     return form[0] * rays[0] + form[1] * rays[1] + form[2]
 
 
-class Frame(NamedTuple):
+class SolidFrame(NamedTuple):
     """S unit solids as the camera sees them.
 
     Attributes:
@@ -63,13 +66,18 @@ class Frame(NamedTuple):
       slope: [S, 2] their change per unit of z.
     """
 
-    turn: Any
-    origin: Any
-    width: Any
-    slope: Any
+    turn: Float[Array, "*S 3 3"]
+    origin: Float[Array, "*S 3"]
+    width: Float[Array, "*S 2"]
+    slope: Float[Array, "*S 2"]
 
 
-def camera_frame(to_unit, center, taper, poses) -> Frame:
+def camera_frame(
+    to_unit: Float[Array, "S 3 3"],
+    center: Float[Array, "S 3"],
+    taper: Float[Array, "S 2"] | None,
+    poses: Float[Any, "S 4 4"],
+) -> SolidFrame:
     """The frame of S solids; arguments as of ``SolidGroup``, poses [S, 4, 4] rest -> camera."""
     rotation, translation = poses[..., :3, :3], poses[..., :3, 3]
     # to_unit @ rotation.T, elementwise.
@@ -77,7 +85,7 @@ def camera_frame(to_unit, center, taper, poses) -> Frame:
     origin = -matvec(turn, translation + matvec(rotation, center))
     taper = jnp.ones_like(origin[..., :2]) if taper is None else taper
     slope = 0.5 * (taper - 1.0)
-    return Frame(turn, origin, 0.5 * (taper + 1.0) + slope * origin[..., 2:], slope)
+    return SolidFrame(turn, origin, 0.5 * (taper + 1.0) + slope * origin[..., 2:], slope)
 
 
 class _Slab(NamedTuple):
@@ -122,7 +130,7 @@ class _Sides(NamedTuple):
     limit: Any
 
 
-def _sides(frame: Frame) -> _Sides:
+def _sides(frame: SolidFrame) -> _Sides:
     forms, margins = [], []
     for axis in (0, 1):
         fall = frame.slope[..., axis, None] * frame.turn[..., 2, :]
@@ -169,7 +177,7 @@ def _within(round_: _Round, a, b, discriminant):
     return near, jnp.where(b < 0, other, one)
 
 
-def _box_surface(frame: Frame):
+def _box_surface(frame: SolidFrame):
     slab = _slab(frame.origin)
     return (frame.turn, slab), (slab.open == 0).any(-1)
 
@@ -183,7 +191,7 @@ def _box_interval(surface, rays):
     return near, far
 
 
-def _frustum_surface(frame: Frame):
+def _frustum_surface(frame: SolidFrame):
     slab, sides = _slab(frame.origin[..., 2]), _sides(frame)
     return (frame.turn[..., 2, :], slab, sides), (slab.open == 0) | (sides.limit < 0).any(-1)
 
@@ -198,7 +206,7 @@ def _frustum_interval(surface, rays):
     return near, far
 
 
-def _cylinder_surface(frame: Frame):
+def _cylinder_surface(frame: SolidFrame):
     slab, round_ = _slab(frame.origin[..., 2]), _round(frame.origin[..., :2])
     return (frame.turn, frame.origin, slab, round_), (slab.open == 0) | (round_.open < 0)
 
@@ -215,7 +223,7 @@ def _cylinder_interval(surface, rays):
     return smaller(near, enter), larger(far, leave)
 
 
-def _ellipsoid_surface(frame: Frame):
+def _ellipsoid_surface(frame: SolidFrame):
     round_ = _round(frame.origin)
     return (frame.turn, frame.origin, round_), round_.open < 0
 
@@ -229,7 +237,7 @@ def _ellipsoid_interval(surface, rays):
     return _within(round_, a, x * u + y * v + z * w, discriminant)
 
 
-def _cone_surface(frame: Frame):
+def _cone_surface(frame: SolidFrame):
     origin, width = frame.origin, frame.width[..., 0]
     slab = _slab(origin[..., 2])
     c = origin[..., 0] ** 2 + origin[..., 1] ** 2 - width**2

@@ -1,7 +1,7 @@
 """Exact ray casting of an articulated object made of solids (one instance; vmap over batches).
 
 A solid minus a convex hole is hit at its near side unless that lies inside the hole, then where the
-ray leaves the hole. No iteration, no mesh; data/synthetic/intervals.py holds the formulas.
+ray leaves the hole. No iteration, no mesh; ``intervals`` holds the formulas.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from caper_jax.geometry.solids import Kind
 from caper_jax.synthetic.instances import SolidGroup
@@ -26,6 +27,8 @@ from caper_jax.synthetic.intervals import (
 )
 
 FAR = 1e9
+# x and y of directions (x, y, 1) in the camera frame.
+Rays = tuple[Float[Any, " R"], Float[Any, " R"]] | Float[Any, "2 R"]
 _UNIT_CORNERS = [[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
 
 
@@ -60,7 +63,9 @@ def _surfaces(groups: dict[str, SolidGroup], poses):
     return {key: at(found[kind], place) for key, (kind, place) in places.items()}
 
 
-def part_depths(groups: dict[str, SolidGroup], poses, rays):
+def part_depths(
+    groups: dict[str, SolidGroup], poses: Float[Any, "K 4 4"], rays: Rays
+) -> Float[Array, "K R"]:
     """First hit of each ray on each part, as if the other parts were not there.
 
     Args:
@@ -97,7 +102,9 @@ def part_depths(groups: dict[str, SolidGroup], poses, rays):
     return smaller(1.0 / nearest, FAR)
 
 
-def cast(groups: dict[str, SolidGroup], poses, rays):
+def cast(
+    groups: dict[str, SolidGroup], poses: Float[Any, "K 4 4"], rays: Rays
+) -> tuple[Float[Array, " R"], Int[Array, " R"]]:
     """First hit of each ray on the object; arguments as of ``part_depths``.
 
     Returns:
@@ -106,7 +113,9 @@ def cast(groups: dict[str, SolidGroup], poses, rays):
     return nearest_part(part_depths(groups, poses, rays))
 
 
-def nearest_part(depths):
+def nearest_part(
+    depths: Float[Array, K * R],
+) -> tuple[Float[Array, "*R"], Int[Array, "*R"]]:
     """Depth [R] and part [R] (-1 where there is none) from the depths [K, R] of all parts."""
     depth, part = jnp.full(depths.shape[1:], FAR), jnp.full(depths.shape[1:], -1, jnp.int32)
     for index, other in enumerate(depths):
@@ -115,7 +124,9 @@ def nearest_part(depths):
     return depth, part
 
 
-def projected_bounds(groups: dict[str, SolidGroup], poses):
+def projected_bounds(
+    groups: dict[str, SolidGroup], poses: Float[Any, "K 4 4"]
+) -> tuple[Float[Array, " 2"], Float[Array, " 2"]]:
     """Bounds (low [2], high [2]) of the object on the plane z = 1, from its solids' corners."""
     solids = list(groups.values())
     part = np.concatenate([group.part for group in solids])

@@ -8,12 +8,14 @@ jumps and at grazing incidence, mixed pixels at jumps, and isotropic point noise
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from caper_jax.errors import unknown_name
 
@@ -35,16 +37,16 @@ class Sensor:
       mixing: probability that a pixel at a jump lies between the two surfaces.
     """
 
-    floor: Any
-    origin: Any
-    quadratic: Any
-    incidence: Any
-    focal_baseline: Any
-    disparity_step: Any
-    isotropic: Any
-    jump_loss: Any
-    grazing_loss: Any
-    mixing: Any
+    floor: float | Float[Any, "*batch"]
+    origin: float | Float[Any, "*batch"]
+    quadratic: float | Float[Any, "*batch"]
+    incidence: float | Float[Any, "*batch"]
+    focal_baseline: float | Float[Any, "*batch"]
+    disparity_step: float | Float[Any, "*batch"]
+    isotropic: float | Float[Any, "*batch"]
+    jump_loss: float | Float[Any, "*batch"]
+    grazing_loss: float | Float[Any, "*batch"]
+    mixing: float | Float[Any, "*batch"]
 
 
 PRESETS: dict[str, Sensor] = {
@@ -58,7 +60,7 @@ CAMERAS = ("kinect", "realsense")  # the presets that stand for what is sold
 
 
 def sensor_mix(names: tuple[str, ...]) -> Sensor:
-    """The presets of ``names`` stacked on a leading axis, one drawn per frame by ``draw``.
+    """The presets of ``names`` stacked on a leading axis, one drawn per frame by ``draw_sensor``.
 
     Raises:
       CaperError: unknown preset.
@@ -69,14 +71,14 @@ def sensor_mix(names: tuple[str, ...]) -> Sensor:
     return jax.tree.map(lambda *v: np.array(v, np.float32), *(PRESETS[name] for name in names))
 
 
-def draw(key, mix: Sensor) -> Sensor:
+def draw_sensor(key: PRNGKeyArray, mix: Sensor) -> Sensor:
     """One sensor of the mix, uniformly."""
-    index = jax.random.randint(key, (), 0, mix.floor.shape[0])
+    index = jax.random.randint(key, (), 0, jnp.shape(mix.floor)[0])
     return jax.tree.map(lambda values: jnp.asarray(values)[index], mix)
 
 
 @flax.struct.dataclass
-class Surface:
+class SurfaceMap:
     """What the noise depends on, per pixel [...].
 
     Attributes:
@@ -86,10 +88,10 @@ class Surface:
       reach: meters from this surface to the farthest neighboring one behind it, 0 if none.
     """
 
-    depth: Any
-    cosine: Any
-    jump: Any
-    reach: Any
+    depth: Float[Any, "*pixels"]
+    cosine: Float[Any, "*pixels"]
+    jump: Bool[Any, "*pixels"]
+    reach: Float[Any, "*pixels"]
 
 
 def _shifted(image, fill):
@@ -98,7 +100,11 @@ def _shifted(image, fill):
     return padded[1:-1, 2:], padded[1:-1, :-2], padded[2:, 1:-1], padded[:-2, 1:-1]
 
 
-def surface(depth, hit, rays) -> Surface:
+def surface_map(
+    depth: Float[Any, "H W"],
+    hit: Bool[Any, "H W"],
+    rays: Sequence[Float[Any, "H W"]],
+) -> SurfaceMap:
     """Incidence and depth jumps from finite differences of a clean depth image.
 
     Args:
@@ -129,10 +135,12 @@ def surface(depth, hit, rays) -> Surface:
     b = (below - inverse) / jnp.maximum(step_y, 1e-9)
     c = inverse - a * x - b * y
     norm = jax.lax.rsqrt((a * a + b * b + c * c) * (x * x + y * y + 1.0))
-    return Surface(depth, jnp.clip(inverse * norm, 0.17, 1.0), jump, reach)
+    return SurfaceMap(depth, jnp.clip(inverse * norm, 0.17, 1.0), jump, reach)
 
 
-def lose(key, sensor: Sensor, surface: Surface, hit):
+def valid_pixels(
+    key: PRNGKeyArray, sensor: Sensor, surface: SurfaceMap, hit: Bool[Any, "*pixels"]
+) -> Bool[Array, "*pixels"]:
     """[...] bool: the hits for which the sensor returns a depth."""
     uniform = jax.random.uniform(key, hit.shape)
     lost = surface.jump & (uniform < sensor.jump_loss)
@@ -140,7 +148,12 @@ def lose(key, sensor: Sensor, surface: Surface, hit):
     return hit & ~lost
 
 
-def measure(key, sensor: Sensor, surface: Surface, rays):
+def measure(
+    key: PRNGKeyArray,
+    sensor: Sensor,
+    surface: SurfaceMap,
+    rays: Sequence[Float[Any, "*pixels"]],
+) -> Float[Array, "*pixels 3"]:
     """Measured points [..., 3], meters, camera frame, for pixels of any shape [...]."""
     normal_key, uniform_key = jax.random.split(key)
     x, y = rays

@@ -13,15 +13,15 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float, Int
 
 from caper_jax.articulation.category import Category
-from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.urdf.canonical import ImportedObject
-from caper_jax.data.urdf.meshes import NEEDS_MESH, Mesh
+from caper_jax.data.urdf import ImportedObject
 from caper_jax.errors import CaperError
+from caper_jax.geometry.meshes import NEEDS_MESH, Mesh
 from caper_jax.geometry.raster_order import grid_raster_order
 from caper_jax.synthetic import sensor as sensors
-from caper_jax.synthetic.frames import Batch, Keys, draw_state_and_poses
+from caper_jax.synthetic.frames import Batch, FrameKeys, articulated_pose, draw_state_and_poses
 from caper_jax.synthetic.instances import InstanceBank, split_key
 
 
@@ -57,8 +57,11 @@ class PartCaster:
         self.outlines = [_outline(mesh) for mesh in meshes]
 
     def cast(
-        self, poses: np.ndarray, origins: np.ndarray, directions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self,
+        poses: Float[np.ndarray, "K 4 4"],
+        origins: Float[np.ndarray, "R 3"],
+        directions: Float[np.ndarray, "R 3"],
+    ) -> tuple[Float[np.ndarray, "K R"], Int[np.ndarray, "K R"]]:
         """Where rays meet each part, were it alone.
 
         Args:
@@ -89,7 +92,9 @@ class PartCaster:
             reach[k, hit[good]], faces[k, hit[good]] = along[good], face[good]
         return reach, faces
 
-    def normals(self, part: int, faces: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    def normals(
+        self, part: int, faces: Int[np.ndarray, " R"], pose: Float[np.ndarray, "4 4"]
+    ) -> Float[np.ndarray, "R 3"]:
         """Unit normals [R, 3] of triangles of a part under a pose [4, 4], of either sign."""
         normal = self._normals[part][faces] @ pose[:3, :3].T
         return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -133,7 +138,7 @@ def render_frames(
     """
     category = objects[0].category
     mix = sensors.sensor_mix((noise,))
-    casters = [PartCaster(item.reference.parts) for item in objects]
+    casters = [PartCaster(item.at_rest.parts) for item in objects]
     instance = np.arange(frames) % len(objects)
     bank = _bank(objects)
     key = split_key(split, seed)
@@ -149,15 +154,7 @@ def render_frames(
         rows.append(_observe(keys, index, caster, poses[index], rays, mix, picks[index]))
         report(1)
     points, labels, visible, visibility = (np.stack(column) for column in zip(*rows, strict=True))
-    pose = ArticulatedPose(
-        rotation=poses[:, :, :3, :3],
-        translation=poses[:, :, :3, 3],
-        size=bank.size[instance],
-        box_center=bank.box_center[instance],
-        joint_axis=bank.joint_axis[instance],
-        joint_pivot=bank.joint_pivot[instance],
-        joint_state=states,
-    )
+    pose = articulated_pose(instances, states, poses)
     return Batch(points, labels, pose, visible, instance.astype(np.int32), visibility)
 
 
@@ -169,8 +166,8 @@ def _bank(objects: Sequence[ImportedObject]) -> InstanceBank:
 
     return InstanceBank(
         groups={},
-        joint_axis=stack([item.reference.axis for item in objects]),
-        joint_pivot=stack([item.reference.pivot for item in objects]),
+        joint_axis=stack([item.at_rest.axis for item in objects]),
+        joint_pivot=stack([item.at_rest.pivot for item in objects]),
         limits=stack([item.states for item in objects]),
         size=stack([item.size for item in objects]),
         box_center=stack([item.box_center for item in objects]),
@@ -182,7 +179,7 @@ def _draw(frame_keys, instances: InstanceBank, category: Category, num_points: i
     """Keys, states [F, J], poses [F, K, 4, 4], and uniform numbers for the grid and the picks."""
 
     def one(key, instance):
-        keys = Keys(*jax.random.split(key, 8))
+        keys = FrameKeys(*jax.random.split(key, 8))
         state, poses, _ = draw_state_and_poses(keys.scene, instance, category)
         grid = jax.random.uniform(keys.grid, (2,))
         return keys, state, poses, grid, jax.random.uniform(keys.pick, (num_points,))
@@ -206,7 +203,7 @@ def _ray_grid(
 
 
 def _observe(
-    keys: Keys, frame: int, caster: PartCaster, poses: np.ndarray, rays, mix, pick: np.ndarray
+    keys: FrameKeys, frame: int, caster: PartCaster, poses: np.ndarray, rays, mix, pick: np.ndarray
 ):
     """Points [N, 3], labels [N], and pixels and unhidden share [K] of each part."""
     directions = np.stack([*rays, np.ones_like(rays[0])], axis=-1).reshape(-1, 3)
@@ -232,12 +229,12 @@ def _observe(
 
 
 @jax.jit
-def _sense(keys: Keys, frame, mix, depth, hit, rays):
-    sensor = sensors.draw(keys.sensor[frame], mix)
-    surface = sensors.surface(depth, hit, rays)
-    return sensor, surface, sensors.lose(keys.loss[frame], sensor, surface, hit)
+def _sense(keys: FrameKeys, frame, mix, depth, hit, rays):
+    sensor = sensors.draw_sensor(keys.sensor[frame], mix)
+    surface = sensors.surface_map(depth, hit, rays)
+    return sensor, surface, sensors.valid_pixels(keys.loss[frame], sensor, surface, hit)
 
 
 @jax.jit
-def _measure(keys: Keys, frame, sensor, chosen, rays):
+def _measure(keys: FrameKeys, frame, sensor, chosen, rays):
     return sensors.measure(keys.noise[frame], sensor, chosen, rays)

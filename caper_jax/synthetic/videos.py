@@ -1,30 +1,33 @@
 """Endless labeled videos: one instance whose joints, and perhaps the camera, move.
 
 The protocol of PM-Videos (paper Sec. 6.1.1), two harder ones, and one in which nothing moves; every
-frame is drawn by ``scene``.
+frame is drawn by ``frames``.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from caper_jax.articulation.category import Category
 from caper_jax.config import GeneratorConfig
 from caper_jax.errors import CaperError, unknown_name
+from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.synthetic import sensor as sensors
 from caper_jax.synthetic.camera import camera_arc, camera_pose, draw_camera
-from caper_jax.synthetic.frames import Batch, Keys, observe, part_poses, rest_diagonal
-from caper_jax.synthetic.instances import InstanceBank, build_bank, draw_instances
+from caper_jax.synthetic.frames import Batch, FrameKeys, collect, observe, part_poses
+from caper_jax.synthetic.instances import InstanceBank, build_bank, draw_instances, split_key
 
 FRAMES = 30
 
 
-class Mode(NamedTuple):
+class VideoMode(NamedTuple):
     """How a video moves; traced, so that one compiled program serves all modes.
 
     Attributes:
@@ -33,21 +36,21 @@ class Mode(NamedTuple):
       still: whether the joints stay where they are.
     """
 
-    camera_speed: float | jax.Array
-    reverses: bool | jax.Array
-    still: bool | jax.Array = False
+    camera_speed: float | Float[Array, ""]
+    reverses: bool | Bool[Array, ""]
+    still: bool | Bool[Array, ""] = False
 
 
 MODES = {
-    "paper": Mode(camera_speed=0.0, reverses=False),
-    "cam": Mode(camera_speed=1.0, reverses=False),
-    "hard": Mode(camera_speed=2.0, reverses=True),
-    "still": Mode(camera_speed=0.0, reverses=False, still=True),
+    "paper": VideoMode(camera_speed=0.0, reverses=False),
+    "cam": VideoMode(camera_speed=1.0, reverses=False),
+    "hard": VideoMode(camera_speed=2.0, reverses=True),
+    "still": VideoMode(camera_speed=0.0, reverses=False, still=True),
 }
 
 
 def video(
-    key,
+    key: PRNGKeyArray,
     instance: InstanceBank,
     category: Category,
     config: GeneratorConfig,
@@ -89,35 +92,35 @@ def check_length(frames: int) -> None:
         raise CaperError(f"a video needs at least 2 frames, got {frames}")
 
 
-def _motion(mode: str, frames: int) -> Mode:
+def _motion(mode: str, frames: int) -> VideoMode:
     """A mode as arrays."""
     if mode not in MODES:
         raise unknown_name("video mode", mode, MODES)
     check_length(frames)
     speed, reverses, still = MODES[mode]
-    return Mode(jnp.float32(speed), jnp.asarray(reverses), jnp.asarray(still))
+    return VideoMode(jnp.float32(speed), jnp.asarray(reverses), jnp.asarray(still))
 
 
 @partial(jax.jit, static_argnames=("category", "config", "frames"))
 def _video(
     key,
     instance: InstanceBank,
-    motion: Mode,
+    motion: VideoMode,
     category: Category,
     config: GeneratorConfig,
     frames: int,
 ) -> Batch:
     state_key, camera_key, arc_key, shared_key, frame_key = jax.random.split(key, 5)
-    view, diagonal = category.viewpoint, rest_diagonal(instance)
+    view, diagonal = category.viewpoint, rest_diagonal(instance.size, instance.box_center)
     states = _states(state_key, instance.limits, motion, frames)
     cameras = camera_arc(arc_key, draw_camera(camera_key, view), view, frames, motion.camera_speed)
-    shared = Keys(*jax.random.split(shared_key, len(Keys._fields)))
+    shared = FrameKeys(*jax.random.split(shared_key, len(FrameKeys._fields)))
     mix = sensors.sensor_mix(config.noise)
 
     def frame(inputs):
         key, state, camera = inputs
         poses = part_poses(camera_pose(camera, view, diagonal), instance, state, category)
-        fresh = Keys(*jax.random.split(key, len(Keys._fields)))
+        fresh = FrameKeys(*jax.random.split(key, len(FrameKeys._fields)))
         keys = fresh._replace(mask=shared.mask, sensor=shared.sensor)
         return observe(keys, instance, state, poses, category, config, mix)
 
@@ -129,7 +132,7 @@ def _video(
 def _batch(
     key,
     bank: InstanceBank,
-    motion: Mode,
+    motion: VideoMode,
     category: Category,
     config: GeneratorConfig,
     frames: int,
@@ -146,7 +149,7 @@ def _batch(
     return replace(batch, instance=jnp.broadcast_to(index[:, None], (videos, frames)))
 
 
-def _states(key, limits, motion: Mode, frames: int):
+def _states(key, limits, motion: VideoMode, frames: int):
     """Joint states [T, J] of a clip from the limits [J, 2]."""
     joints = limits.shape[0]
     uniform = jax.random.uniform(key, (frames + 3, joints))
@@ -201,7 +204,7 @@ class VideoGenerator:
         models = draw_instances(category, self.config.instances, split, seed)
         self.bank = jax.tree.map(jnp.asarray, build_bank(models))
 
-    def batch(self, key, videos: int) -> Batch:
+    def batch(self, key: PRNGKeyArray, videos: int) -> Batch:
         """Videos of instances of the bank; the same key gives the same videos.
 
         Args:
@@ -213,3 +216,21 @@ class VideoGenerator:
         """
         settings = (self.category, self.config, self.frames)
         return _batch(key, self.bank, self._motion, *settings, videos)
+
+
+def collect_videos(
+    generator: VideoGenerator, seed: int, videos: int, size: int, title: str = "generating"
+) -> dict[str, Any]:
+    """Videos one after the other, as the arguments of ``hdf5.write`` that they decide.
+
+    Args:
+      generator: draws them, of its split.
+      seed: of the split's key, see ``split_key``.
+      size, title: see ``collect``.
+      videos: V.
+    """
+    batch = collect(generator.batch, split_key(generator.split, seed), videos, size, title)
+    batch = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), batch)
+    video, frame = np.divmod(np.arange(len(batch.points)), generator.frames)
+    names = [f"{v:05d}/{f:06d}" for v, f in zip(video, frame, strict=True)]
+    return {**vars(batch), "names": names, "video": video, "frame": frame}

@@ -15,6 +15,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import Array as AnyArray
 from caper_jax.config import NetworkConfig
 from caper_jax.estimator import estimate
+from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.geometry.frames import canonicalize
 from caper_jax.geometry.raster_order import from_raster_order, raster_order, to_raster_order
 from caper_jax.lie import linalg, se3, so3
@@ -142,9 +143,7 @@ def update_parameters(old: ObjectParameters, new: ObjectParameters) -> ObjectPar
 
 def diagonal(parameters: ObjectParameters):
     """[] length of the diagonal of the object's box at rest."""
-    half = jnp.abs(parameters.size) / 2
-    low, high = (parameters.center - half).min(0), (parameters.center + half).max(0)
-    return jnp.maximum(linalg.norm(high - low), 1e-3)
+    return jnp.maximum(rest_diagonal(jnp.abs(parameters.size), parameters.center), 1e-3)
 
 
 def part_coordinates(measurement: PoseMeasurement, points):

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from caper_jax.data.urdf.canonical import ImportedObject
+from caper_jax.data.urdf import ImportedObject
 from caper_jax.synthetic.urdf_frames import PartCaster
 from caper_jax.visualization.plots import save_figure
 from caper_jax.visualization.scene import part_color
@@ -44,8 +44,8 @@ def write_model_check(path: str | Path, item: ImportedObject) -> Path:
     """
     figure = Figure(figsize=(16.6, 5.4), dpi=DPI)
     axes = figure.subplots(1, 4)
-    caster = PartCaster(item.reference.parts)
-    rest = np.zeros(item.reference.num_joints)
+    caster = PartCaster(item.at_rest.parts)
+    rest = np.zeros(item.at_rest.num_joints)
     for axis, (title, view) in zip(axes, VIEWS.items(), strict=False):
         _draw_view(axis, item, caster, rest, view)
         axis.set_title(f"at rest, {title}", fontsize=10)
@@ -84,9 +84,9 @@ def _draw_view(
     axis: Axes, item: ImportedObject, caster: PartCaster, states: np.ndarray, view: np.ndarray
 ) -> None:
     """One parallel projection with the axes and the joints over it."""
-    poses = item.reference.poses(states)
+    poses = item.at_rest.poses(states)
     moved = [
-        part.moved(pose).vertices for part, pose in zip(item.reference.parts, poses, strict=True)
+        part.moved(pose).vertices for part, pose in zip(item.at_rest.parts, poses, strict=True)
     ]
     seen = np.concatenate(moved) @ view.T
     middle = (seen.max(0) + seen.min(0)) / 2
@@ -109,14 +109,14 @@ def _draw_view(
     axis.imshow(image.reshape(PIXELS, PIXELS, 3), extent=extent, interpolation="nearest")
     for index, (name, color) in enumerate(zip("xyz", AXIS_COLORS, strict=True)):
         _arrow(axis, np.zeros(3), view[:, index] * 0.45 * half, color, name)
-    reference = item.reference
-    for joint, parent in enumerate(reference.parents):
+    at_rest = item.at_rest
+    for joint, parent in enumerate(at_rest.parents):
         carrier = poses[parent]
         # A slide has no place of its own: drawn through the middle of what it carries.
-        slides = reference.kinds[joint] == "prismatic"
-        place = item.box_center[joint + 1] if slides else reference.pivot[joint]
+        slides = at_rest.kinds[joint] == "prismatic"
+        place = item.box_center[joint + 1] if slides else at_rest.pivot[joint]
         pivot = carrier[:3, :3] @ place + carrier[:3, 3]
-        along = carrier[:3, :3] @ reference.axis[joint]
+        along = carrier[:3, :3] @ at_rest.axis[joint]
         _arrow(axis, view @ pivot, view @ along * 0.3 * half, "black", str(joint + 1))
     axis.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])
 

@@ -21,7 +21,7 @@ from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data import hdf5
 from caper_jax.geometry import solids
 from caper_jax.synthetic.artimage_writer import LayoutWriter
-from caper_jax.synthetic.render import Image
+from caper_jax.synthetic.images import Image
 
 SIZE = (96, 72)  # width, height
 CAMERA = np.array([[120.0, 0.0, 47.0], [0.0, 118.0, 36.0], [0.0, 0.0, 1.0]])

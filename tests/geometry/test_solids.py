@@ -29,7 +29,7 @@ def draw(rng: np.random.Generator, kind: str, scale: float, hole: Solid | None =
 @pytest.mark.parametrize(("kind", "hole"), [*itertools.product(KINDS, KINDS)])
 def test_what_a_hole_leaves(kind, hole):
     pytest.importorskip("manifold3d")
-    from caper_jax.data.urdf.export import part_mesh
+    from caper_jax.synthetic.urdf_export import part_mesh
 
     rng = np.random.default_rng(KINDS.index(kind) * 5 + KINDS.index(hole))
     cut = 0

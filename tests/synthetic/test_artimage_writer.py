@@ -14,11 +14,11 @@ from caper_jax.cli import generate, generate_layout
 from caper_jax.data.readers import open_dataset
 from caper_jax.data.types import validate
 from caper_jax.errors import CaperError
+from caper_jax.geometry.solid_surface import surface_points
 from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.artimage_writer import LayoutWriter
+from caper_jax.synthetic.images import Image
 from caper_jax.synthetic.instances import draw_instances
-from caper_jax.synthetic.render import Image
-from caper_jax.synthetic.surface import surface_points
 
 SIZE = 64
 CAMERA = np.array([[91.4, 0.0, 31.5], [0.0, 90.0, 32.5], [0.0, 0.0, 1.0]])
@@ -199,16 +199,6 @@ def test_objects_of_a_run_that_was_cut_off_are_not_mixed_in(tmp_path):
     with pytest.raises(CaperError, match=r"holds an object 7 already; choose .* delete"):
         writer.add_object(7, second)
     assert next(tmp_path.glob("box/urdf/7/*/0.xyz")).read_bytes() == points
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_surface_points_reach_the_bounds_and_lie_within(name):
-    for model in draw_instances(categories.get(name), 5, "train", 1):
-        for solids in model.parts:
-            points = surface_points(solids, 300, np.random.default_rng(0))
-            low, high = bounds(solids)
-            np.testing.assert_allclose(points.min(0), low, atol=1e-12)
-            np.testing.assert_allclose(points.max(0), high, atol=1e-12)
 
 
 def test_the_stored_joints_have_the_public_sign(tmp_path):

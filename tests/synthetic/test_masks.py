@@ -17,8 +17,8 @@ from caper_jax.config import GeneratorConfig
 from caper_jax.synthetic import masks
 from caper_jax.synthetic.frames import Generator
 from caper_jax.synthetic.instances import build_bank, draw_instances
+from caper_jax.synthetic.masks import add_clutter, spill_on_table, table_depth
 from caper_jax.synthetic.ray_casting import FAR
-from caper_jax.synthetic.surroundings import add_clutter, spill_on_table, table_depth
 
 SIDE, KEYS = 64, 300
 ROWS, COLUMNS = np.indices((SIDE, SIDE))
@@ -93,17 +93,17 @@ def test_any_pixel_draws_each_alike():
     few = np.zeros((SIDE, SIDE), bool)
     few[[3, 3, 40], [5, 60, 2]] = True
     draws = np.linspace(0, 0.9999, 300)
-    rows, columns = jax.vmap(lambda u: masks.any_pixel(u, jnp.asarray(few)))(draws)
+    rows, columns = jax.vmap(lambda u: masks.random_pixel(u, jnp.asarray(few)))(draws)
     found, counts = np.unique(np.stack([rows, columns]), axis=1, return_counts=True)
     np.testing.assert_array_equal(found, [[3, 3, 40], [5, 60, 2]])
     np.testing.assert_array_equal(counts, [100, 100, 100])
 
 
 def test_missing_pixels_and_holes():
-    lone = over_keys(lambda key: masks.drop(key, HIT, 0.2, 0.0))
+    lone = over_keys(lambda key: masks.missing_depth(key, HIT, 0.2, 0.0))
     shares = lone.mean((1, 2))
     assert shares.max() < 0.22 and 0.08 < shares.mean() < 0.12  # uniform from 0 to 0.2
-    holes = over_keys(lambda key: masks.drop(key, HIT, 0.0, 0.5))
+    holes = over_keys(lambda key: masks.missing_depth(key, HIT, 0.0, 0.5))
     some = (holes & DISC).any((1, 2))
     assert 0.42 < some.mean() < 0.58
     # Up to four ellipses within 8 % of the side in radius.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from caper_jax.cli import generate
-from caper_jax.synthetic import frames, render, videos, views
+from caper_jax.synthetic import frames, images, videos
 
 VIDEOS = ("--videos", "1", "--frames-per-video", "2")
 
@@ -25,9 +25,9 @@ def stop(*arguments, **_):
     [
         ((), frames.Generator, "batch"),
         (VIDEOS, videos.VideoGenerator, "batch"),
-        (("--images",), render, "render_image"),
-        (("--layout", "artimage"), views, "still"),
-        (("--layout", "pm-videos", *VIDEOS), views, "clip"),
+        (("--images",), images, "render_image"),
+        (("--layout", "artimage"), images, "render_still"),
+        (("--layout", "pm-videos", *VIDEOS), images, "render_clip"),
     ],
 )
 def test_every_split_has_its_own_keys(options, owner, name, tmp_path, monkeypatch):

@@ -7,6 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.mesh_object import MeshObject
+from caper_jax.articulation.urdf_rule import (
+    CanonicalAxes,
+    UrdfRule,
+    Y,
+    Z,
+    along_positive,
+    closed_states,
+    level,
+    opening_sign,
+    opens_along,
+)
 from caper_jax.categories.drawer import cabinet
 from caper_jax.categories.drawer.cabinet import Plan
 from caper_jax.categories.forms import TURN_Y, Handle, HandleStyle, StandStyle, stand
@@ -182,6 +194,33 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     return ObjectModel([body, *drawers], np.tile([0.0, 0.0, 1.0], (3, 1)), np.array(pivots), limits)
 
 
+def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
+    """Front where the drawers go, up along their stack."""
+    front = ref.axis[0] * opening_sign(ref, 0)
+    up = _stack(ref, front)
+    if up is None:
+        # z, as in robotics, or y, as in graphics, where z lies along the front.
+        return CanonicalAxes(Z if abs(front[2]) < 0.7 else Y, front, ("up",))
+    return CanonicalAxes(up, front)
+
+
+def _stack(ref: MeshObject, front: np.ndarray) -> np.ndarray | None:
+    """The direction across the front in which the drawers follow one another.
+
+    None where they spread nearly as far the other way, or would be much taller than wide: such
+    drawers stand side by side.
+    """
+    across = np.eye(3) - np.outer(front, front)
+    centers = np.array([mesh.bounds().mean(0) for mesh in ref.parts[1:]]) @ across
+    variance, directions = np.linalg.eigh(np.cov(centers.T))
+    up = along_positive(level(directions[:, -1]))
+    height, width = (
+        np.mean([np.ptp(mesh.vertices @ direction) for mesh in ref.parts[1:]])
+        for direction in (up, np.cross(up, front))
+    )
+    return up if variance[-1] > 4 * variance[-2] and height < 1.25 * width else None
+
+
 DRAWER = Category(
     name="drawer",
     parts=("body", "drawer1", "drawer2", "drawer3"),
@@ -202,4 +241,12 @@ DRAWER = Category(
         (-0.002, 0.257, 0.031),
     ),
     shape=shape,
+    urdf_rule=UrdfRule(
+        rest=closed_states,
+        axes=_urdf_axes,
+        opening=opens_along(Z),
+        order=1,
+        partnet_classes=("StorageFurniture", "Table"),
+    ),
+    artimage_id=4,
 )

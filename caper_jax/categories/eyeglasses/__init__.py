@@ -10,6 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.mesh_object import MeshObject
+from caper_jax.articulation.urdf_rule import (
+    CanonicalAxes,
+    UrdfRule,
+    along_positive,
+    snap_state,
+)
 from caper_jax.categories.eyeglasses import front as fronts
 from caper_jax.categories.forms import about, beam, mirrored
 from caper_jax.geometry.solids import Solid, ellipsoid
@@ -155,6 +162,30 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     )
 
 
+def _unfolded(ref: MeshObject) -> np.ndarray:
+    """Every temple at a right angle to the front, within its range."""
+    states = []
+    for joint in range(ref.num_joints):
+        turn = ref.turn(joint, ref.direction(0, joint), ref.direction(joint + 1, joint))
+        low, high = ref.limits[joint] + np.radians([-20, 20])
+        choices = [sign * np.pi / 2 - turn for sign in (-3, -1, 1, 3)]
+        inside = [state for state in choices if low <= state <= high] or choices
+        state = min(inside, key=abs)
+        states.append(snap_state(state, ref.limits[joint], 20.0))
+    return np.array(states)
+
+
+def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
+    back = np.sum([ref.direction(joint + 1, joint) for joint in range(ref.num_joints)], axis=0)
+    return CanonicalAxes(along_positive(ref.axis[0]), -back)
+
+
+def _temple_axes(ref: MeshObject) -> np.ndarray:
+    """A temple folds to the middle: about -y at -x, about +y at +x."""
+    sides = np.array([mesh.bounds()[:, 0].mean() for mesh in ref.parts[1:]])
+    return np.sign(sides)[:, None] * _Y
+
+
 EYEGLASSES = Category(
     name="eyeglasses",
     closed="high",
@@ -169,4 +200,13 @@ EYEGLASSES = Category(
     mean_size=((0.134, 0.044, 0.017), (0.009, 0.029, 0.126), (0.009, 0.029, 0.126)),
     mean_center=((0.0, 0.002, 0.062), (-0.063, -0.002, -0.008), (0.063, -0.002, -0.008)),
     shape=shape,
+    urdf_rule=UrdfRule(
+        rest=_unfolded,
+        axes=_urdf_axes,
+        opening=_temple_axes,
+        order=0,
+        snap=20.0,
+        partnet_classes=("Eyeglasses",),
+    ),
+    artimage_id=2,
 )

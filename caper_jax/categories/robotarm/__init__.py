@@ -17,6 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.mesh_object import MeshObject
+from caper_jax.articulation.urdf_rule import (
+    CanonicalAxes,
+    UrdfRule,
+    along_positive,
+)
 from caper_jax.categories.forms import about, along
 from caper_jax.categories.robotarm import chains
 from caper_jax.geometry.solids import Solid, box, cone, cylinder, ellipsoid, frustum
@@ -219,6 +225,23 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     )
 
 
+def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
+    """Up along the first axis, from base to shoulder; front where the tip is at rest."""
+    base, shoulder, tip = (ref.parts[part].bounds().mean(0) for part in (0, 1, -1))
+    reach = tip - base
+    up = ref.axis[0] * (1.0 if ref.axis[0] @ (shoulder - base) >= 0 else -1.0)
+    level = reach - (reach @ up) * up
+    if np.linalg.norm(level) < 0.03 * np.linalg.norm(np.ptp(ref.bounds(), axis=0)):
+        # Straight up: x where z is up (robotics), z where y is up (graphics).
+        return CanonicalAxes(up, np.roll(along_positive(up), 1), ("front",))
+    return CanonicalAxes(up, level)
+
+
+def _positive_axes(ref: MeshObject) -> np.ndarray:
+    """Positive about the canonical axis that is nearest at rest."""
+    return np.eye(3)[np.argmax(np.abs(ref.axis), axis=1)]
+
+
 ROBOTARM = Category(
     name="robotarm",
     closed=None,
@@ -251,4 +274,5 @@ ROBOTARM = Category(
         (0.027, 0.315, 0.210),
     ),
     shape=shape,
+    urdf_rule=UrdfRule(axes=_urdf_axes, opening=_positive_axes, snap=50.0),
 )

@@ -22,6 +22,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from caper_jax.articulation.category import Category
+from caper_jax.articulation.mesh_object import MeshObject
 from caper_jax.data.readers.artimage_frames import AxisMap, Rest, canonical_axes
 from caper_jax.data.readers.artimage_models import RestModel, rest_model
 from caper_jax.data.readers.public_urdf import (
@@ -32,10 +33,8 @@ from caper_jax.data.readers.public_urdf import (
     parse,
     vector,
 )
-from caper_jax.data.urdf.meshes import Mesh, join
-from caper_jax.data.urdf.reference import Reference
-from caper_jax.data.urdf.rules import rule_of
 from caper_jax.errors import CaperError
+from caper_jax.geometry.meshes import Mesh, join
 
 URDF = "mobility.urdf"
 
@@ -84,7 +83,7 @@ def read_model(folder: Path, category: Category) -> RestModel:
     upright = np.linalg.inv(visuals[0][0])
     poses = [upright, *(upright @ joints[link].origin for link in links[1:])]
     moving = [joints[link] for link in links[1:]]
-    reference = Reference(
+    reference = MeshObject(
         parts=tuple(mesh.moved(pose) for (_, mesh), pose in zip(visuals, poses, strict=True)),
         kinds=tuple(joint.kind for joint in moving),
         parents=category.parents,
@@ -95,7 +94,7 @@ def read_model(folder: Path, category: Category) -> RestModel:
     if _other_root(reference, category):
         reference, links, poses = reference.exchanged(), links[::-1], poses[::-1]
 
-    states = rule_of(category.name).rest(reference)
+    states = category.urdf_rule.rest(reference)
     at_rest = reference.at(states)
     low, high = at_rest.limits.T
     rest = Rest(
@@ -105,25 +104,25 @@ def read_model(folder: Path, category: Category) -> RestModel:
         opening=np.where(high >= -low, 1.0, -1.0),
     )
     if category.name == "scissors":
-        reading = _scissors_reading(at_rest)
+        reading = _scissors_reading(at_rest, category)
     else:
         reading = canonical_axes(rest, category, str(path))
     model = rest_model(rest, reference.poses(states) @ np.array(poses), reading)
     return replace(model, links=tuple(links[part] for part in reading.order))
 
 
-def _other_root(reference: Reference, category: Category) -> bool:
+def _other_root(reference: MeshObject, category: Category) -> bool:
     """Whether the second of two parts is our root."""
     if category.name == "laptop":
         heights = [mesh.bounds()[:, 1].mean() for mesh in reference.parts]
         return heights[1] < heights[0]
-    rule = rule_of(category.name)
-    return rule.root is not None and rule.root(reference) == 1
+    root = category.urdf_rule.root
+    return root is not None and root(reference) == 1
 
 
-def _scissors_reading(at_rest: Reference) -> AxisMap:
+def _scissors_reading(at_rest: MeshObject, category: Category) -> AxisMap:
     """x between the tips, y so that the scissors open about it."""
-    up, front, _ = rule_of("scissors").frame(at_rest)
+    up, front, _ = category.urdf_rule.axes(at_rest)
     front = front - (front @ up) * up
     y, z = up / np.linalg.norm(up), front / np.linalg.norm(front)
     turn = np.stack([np.cross(y, z), y, z])

@@ -1,7 +1,8 @@
 """URDF files with their meshes: links, visual geometry, joints, and the poses of links.
 
-Any URDF is read, and the folders of PartNet-Mobility (mobility.urdf with mobility_v2.json,
-semantics.txt and meta.json beside it), whose names of links are kept as labels.
+Any URDF is read, and the folders of PartNet-Mobility: mobility.urdf, and optionally semantics.txt
+(lines ``link joint name``), mobility_v2.json (a list of {id, name, ...} per link) and meta.json
+(model_cat) beside it, whose names of links are kept as labels.
 """
 
 from __future__ import annotations
@@ -14,13 +15,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
-from caper_jax.data.urdf.folders import PARTNET_URDF, partnet_class, partnet_labels
-from caper_jax.data.urdf.meshes import Mesh, join, read_mesh, shape_mesh
+from caper_jax.articulation.kinematics import joint_transform_float64
+from caper_jax.data.images import read_json
 from caper_jax.errors import CaperError
+from caper_jax.geometry.meshes import NEEDS_MESH, Mesh, join, primitive_mesh, read_mesh
 
+PARTNET_URDF = "mobility.urdf"  # the name of the file in PartNet-Mobility
 Kind = Literal["revolute", "prismatic", "fixed"]
-KINDS: dict[str, Kind] = {
+_KINDS: dict[str, Kind] = {
     "revolute": "revolute",
     "continuous": "revolute",
     "prismatic": "prismatic",
@@ -47,8 +51,8 @@ class UrdfJoint:
     kind: Kind
     parent: str
     child: str
-    origin: np.ndarray
-    axis: np.ndarray
+    origin: Float[np.ndarray, "4 4"]
+    axis: Float[np.ndarray, " 3"]
     limits: tuple[float, float]
     remark: str = ""
     mimic: tuple[str, float, float] | None = None
@@ -81,7 +85,7 @@ class UrdfModel:
     labels: dict[str, str] = field(default_factory=dict)
     object_class: str = ""
 
-    def link_poses(self, states: Mapping[str, float]) -> dict[str, np.ndarray]:
+    def link_poses(self, states: Mapping[str, float]) -> dict[str, Float[np.ndarray, "4 4"]]:
         """Poses [4, 4] of all links in the root link's frame; joints left out stand at 0."""
         outgoing: dict[str, list[UrdfJoint]] = {}
         for joint in self.joints:
@@ -94,7 +98,9 @@ class UrdfModel:
                 state = states.get(joint.name, 0.0)
                 if joint.mimic is not None:
                     state = _followed(joint.mimic, states)
-                motion = joint_motion(joint.kind, joint.axis, np.zeros(3), state)
+                motion = np.eye(4)
+                if joint.kind != "fixed":
+                    motion = joint_transform_float64(joint.kind, joint.axis, np.zeros(3), state)
                 poses[joint.child] = poses[link] @ joint.origin @ motion
                 open_links.append(joint.child)
         return poses
@@ -114,19 +120,6 @@ def _followed(mimic: tuple[str, float, float], states: Mapping[str, float]) -> f
     """State of a mimicking joint at those of the others; joints left out stand at 0."""
     name, multiplier, offset = mimic
     return multiplier * states.get(name, 0.0) + offset
-
-
-def joint_motion(kind: str, axis: np.ndarray, pivot: np.ndarray, state: float) -> np.ndarray:
-    """Float64 twin of ``articulation.kinematics.joint_transform``: a turn or slide [4, 4]."""
-    motion = np.eye(4)
-    if kind == "prismatic":
-        motion[:3, 3] = state * axis
-    elif kind == "revolute":
-        x, y, z = axis
-        hat = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        motion[:3, :3] += np.sin(state) * hat + 2 * np.sin(state / 2) ** 2 * hat @ hat
-        motion[:3, 3] = pivot - motion[:3, :3] @ pivot
-    return motion
 
 
 def read_urdf(path: str | Path) -> UrdfModel:
@@ -157,8 +150,8 @@ def read_urdf(path: str | Path) -> UrdfModel:
         links=links,
         joints=joints,
         root=root,
-        labels=partnet_labels(path.parent) if partnet else {},
-        object_class=partnet_class(path.parent) if partnet else "",
+        labels=_partnet_labels(path.parent) if partnet else {},
+        object_class=_partnet_class(path.parent) if partnet else "",
     )
 
 
@@ -168,9 +161,7 @@ def _parse(path: Path) -> Any:
         from yourdfpy import URDF
         from yourdfpy.urdf import URDFError
     except ImportError:
-        raise CaperError(
-            "reading URDF files needs more packages: pip install 'caper-jax[mesh]'"
-        ) from None
+        raise CaperError(f"reading URDF files {NEEDS_MESH}") from None
     from xml.etree import ElementTree
 
     if not path.is_file():
@@ -197,7 +188,7 @@ def _parse(path: Path) -> Any:
 def _joint(path: Path, joint: Any) -> UrdfJoint:
     where = f"{path}, joint {joint.name!r}"
     origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, np.float64)
-    kind: Kind = KINDS.get(joint.type, "fixed")
+    kind: Kind = _KINDS.get(joint.type, "fixed")
     remark = "" if kind != "fixed" or joint.type == "fixed" else f"{joint.type} joint"
     axis = np.asarray([1, 0, 0] if joint.axis is None else joint.axis, np.float64)
     length = float(np.linalg.norm(axis))
@@ -265,7 +256,7 @@ def _link_mesh(path: Path, link: Any, shapes: list[Any]) -> Mesh | None:
             scale = geometry.mesh.scale
             mesh = read_mesh(file).scaled(1.0 if scale is None else np.asarray(scale, np.float64))
         else:
-            mesh = shape_mesh(geometry, where)
+            mesh = primitive_mesh(geometry, where)
         meshes.append(mesh if shape.origin is None else mesh.moved(np.asarray(shape.origin)))
     meshes = [mesh for mesh in meshes if len(mesh.faces)]
     return join(meshes) if meshes else None
@@ -297,3 +288,63 @@ def _resolve(urdf: Path, filename: str | None, where: str) -> Path:
             return candidate
     looked = "the folders above it and in ROS_PACKAGE_PATH" if found else str(above[0])
     raise CaperError(f"{where}: mesh {filename!r} is not there (looked in {looked})")
+
+
+def find_models(path: str | Path) -> list[Path]:
+    """The URDF files meant by a path, sorted.
+
+    Args:
+      path: a URDF file, a folder with one (PartNet-Mobility's mobility.urdf goes before others),
+        or a folder of such folders.
+
+    Raises:
+      CaperError: nothing there, no URDF, or several in one folder.
+    """
+    path = Path(path)
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise CaperError(f"{path}: no such file or folder")
+    own = _urdf_of(path)
+    if own is not None:
+        return [own]
+    found = [_urdf_of(folder) for folder in sorted(path.iterdir()) if folder.is_dir()]
+    models = [urdf for urdf in found if urdf is not None]
+    if not models:
+        raise CaperError(f"{path}: holds no .urdf file, and no folder in it does")
+    return models
+
+
+def _urdf_of(folder: Path) -> Path | None:
+    """The one URDF of a folder, None when it has none."""
+    if (folder / PARTNET_URDF).is_file():
+        return folder / PARTNET_URDF
+    files = sorted(folder.glob("*.urdf"))
+    if len(files) > 1:
+        names = ", ".join(file.name for file in files[:6])
+        raise CaperError(f"{folder}: holds {len(files)} URDF files ({names}); name one of them")
+    return files[0] if files else None
+
+
+def _partnet_labels(folder: Path) -> dict[str, str]:
+    """What PartNet-Mobility calls its links, from semantics.txt or else mobility_v2.json."""
+    semantics, mobility = folder / "semantics.txt", folder / "mobility_v2.json"
+    if semantics.is_file():
+        rows = [line.split() for line in semantics.read_text(encoding="utf-8").splitlines()]
+        return {row[0]: row[2] for row in rows if len(row) >= 3}
+    if not mobility.is_file():
+        return {}
+    content = read_json(mobility)
+    nodes = content if isinstance(content, list) else []
+    return {
+        f"link_{node['id']}": str(node["name"])
+        for node in nodes
+        if isinstance(node, dict) and "id" in node and "name" in node
+    }
+
+
+def _partnet_class(folder: Path) -> str:
+    """The object's class in meta.json, "" where it says none."""
+    path = folder / "meta.json"
+    content = read_json(path) if path.is_file() else {}
+    return str(content.get("model_cat", "")) if isinstance(content, dict) else ""

@@ -11,20 +11,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from caper_jax.articulation.category import Category
-from caper_jax.data.urdf.link_tree import LinkTree
 from caper_jax.data.urdf.load import UrdfJoint, UrdfModel
 from caper_jax.errors import CaperError, unknown_name
 
 # A piece below this share of the smallest wanted part (diagonals) is a button, a key or a wheel.
 _MINOR = 0.5
-# What the links of a root are never called, but those of its child are: decides which of two
-# parts is the root where PartNet-Mobility hangs the base on the lid.
-CHILD_WORDS = {
-    "laptop": ("screen", "lid", "display", "monitor"),
-    "box": ("lid", "cover"),
-    "dishwasher": ("door",),
-}
 
 
 @dataclass(frozen=True)
@@ -50,7 +44,7 @@ class PartTree:
       links: K tuples of link names, root first.
       joints: K - 1.
       locked: state of every joint of the file that moves there but not here.
-      notes: which joints were locked, for people.
+      notes: which joints were locked, a line each.
     """
 
     links: tuple[tuple[str, ...], ...]
@@ -82,7 +76,7 @@ def map_parts(
       CaperError: too few or too many joints of the right type, or a tree of another form; the
         message lists what there is.
     """
-    tree = LinkTree(model, rest or {})
+    tree = _LinkTree(model, rest or {})
     if chosen is not None:
         root, joints = _chosen_joints(tree, category, chosen)
     elif category.parents == tuple(range(category.num_joints)) and category.num_joints > 1:
@@ -97,7 +91,70 @@ def map_parts(
     return _cut(tree, category, root, joints)
 
 
-def _star_joints(tree: LinkTree, category: Category) -> tuple[str, list[UrdfJoint]]:
+class _LinkTree:
+    """The file's links and movable joints, with the size of what each joint carries."""
+
+    def __init__(self, model: UrdfModel, rest: Mapping[str, float]) -> None:
+        self.model = model
+        self.movable = {j.name: j for j in model.joints if j.moves}
+        self.by_child = {joint.child: joint for joint in model.joints}
+        self.children: dict[str, list[UrdfJoint]] = {}
+        for joint in model.joints:
+            self.children.setdefault(joint.parent, []).append(joint)
+        self.hold = {
+            name: float(rest.get(name, np.clip(0.0, *joint.limits)))
+            for name, joint in self.movable.items()
+        }
+        poses = model.link_poses(self.hold)
+        self.boxes = {
+            name: mesh.moved(poses[name]).bounds()
+            for name, mesh in model.links.items()
+            if mesh is not None
+        }
+        self.size = {
+            name: self.diagonal(self.below(joint.child)) for name, joint in self.movable.items()
+        }
+
+    def below(self, link: str, stop: frozenset[str] = frozenset()) -> list[str]:
+        """A link and all links under it, not past the joints named in ``stop``."""
+        found = [link]
+        for name in found:
+            found += [j.child for j in self.children.get(name, ()) if j.name not in stop]
+        return found
+
+    def diagonal(self, links: Sequence[str]) -> float:
+        """Of the box around links at state 0, meters; 0 without geometry."""
+        boxes = [self.boxes[name] for name in links if name in self.boxes]
+        if not boxes:
+            return 0.0
+        return float(np.linalg.norm(np.max(boxes, 0)[1] - np.min(boxes, 0)[0]))
+
+    def rigid(self, link: str) -> list[str]:
+        """The links fixed to one from above, seen downwards."""
+        return self.below(link, frozenset(self.movable))
+
+    def above(self, link: str) -> list[UrdfJoint]:
+        """Movable joints from a link up to the root, nearest first."""
+        found = []
+        while link in self.by_child:
+            joint = self.by_child[link]
+            if joint.name in self.movable:
+                found.append(joint)
+            link = joint.parent
+        return found
+
+    def describe(self, joints: Sequence[UrdfJoint]) -> str:
+        if not joints:
+            return "none"
+        shown = [f"{j.name} ({j.kind}, carries {j.child}{self.label(j.child)})" for j in joints]
+        rest = len(shown) - 8
+        return ", ".join(shown[:8]) + (f" and {rest} more" if rest > 0 else "")
+
+    def label(self, link: str) -> str:
+        return f" = {self.model.labels[link]}" if link in self.model.labels else ""
+
+
+def _star_joints(tree: _LinkTree, category: Category) -> tuple[str, list[UrdfJoint]]:
     """The root's link and one joint per further part, none of them below another."""
     model, wanted = tree.model, list(category.joint_types)
     root = model.root
@@ -128,12 +185,12 @@ def _star_joints(tree: LinkTree, category: Category) -> tuple[str, list[UrdfJoin
     return _root_by_name(tree, category, root, chosen), chosen
 
 
-def _nested(tree: LinkTree, one: UrdfJoint, other: UrdfJoint) -> bool:
+def _nested(tree: _LinkTree, one: UrdfJoint, other: UrdfJoint) -> bool:
     return one in tree.above(other.child) or other in tree.above(one.child)
 
 
 def _without_empty_links(
-    tree: LinkTree, joints: list[UrdfJoint], wanted: Sequence[str]
+    tree: _LinkTree, joints: list[UrdfJoint], wanted: Sequence[str]
 ) -> list[UrdfJoint]:
     """Of two joints with nothing but frames between them, keeps the one of a wanted type."""
     dropped: set[str] = set()
@@ -149,7 +206,7 @@ def _without_empty_links(
 
 
 def _seat_of_root(
-    tree: LinkTree, joints: list[UrdfJoint], count: int
+    tree: _LinkTree, joints: list[UrdfJoint], count: int
 ) -> tuple[str | None, list[UrdfJoint]]:
     """Where the root of the file is empty or a mere screw, the largest part on it is our root."""
     own = tree.diagonal(tree.below(tree.model.root, frozenset(j.name for j in joints)))
@@ -159,10 +216,10 @@ def _seat_of_root(
 
 
 def _root_by_name(
-    tree: LinkTree, category: Category, root: str, joints: Sequence[UrdfJoint]
+    tree: _LinkTree, category: Category, root: str, joints: Sequence[UrdfJoint]
 ) -> str:
     """The child's link as the root where only the root bears a name that a child should have."""
-    words = CHILD_WORDS.get(category.name, ())
+    words = category.urdf_rule.child_words
     if len(joints) != 1 or not words:
         return root
     child = tree.below(joints[0].child)
@@ -175,7 +232,7 @@ def _root_by_name(
     return joints[0].child if named(rest) and not named(child) else root
 
 
-def _chain_joints(tree: LinkTree, category: Category) -> list[UrdfJoint]:
+def _chain_joints(tree: _LinkTree, category: Category) -> list[UrdfJoint]:
     """The first joints, of the wanted types in order, on the way from the root to a tip."""
     wanted = category.joint_types
     found: dict[tuple[str, ...], list[UrdfJoint]] = {}
@@ -198,7 +255,7 @@ def _chain_joints(tree: LinkTree, category: Category) -> list[UrdfJoint]:
 
 
 def _misfit(
-    tree: LinkTree, category: Category, has: str, joints: Sequence[UrdfJoint]
+    tree: _LinkTree, category: Category, has: str, joints: Sequence[UrdfJoint]
 ) -> CaperError:
     kinds = category.joint_types
     needs = " and ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
@@ -211,7 +268,7 @@ def _misfit(
 
 
 def _chosen_joints(
-    tree: LinkTree, category: Category, chosen: Sequence[str]
+    tree: _LinkTree, category: Category, chosen: Sequence[str]
 ) -> tuple[str, list[UrdfJoint]]:
     """The joints between links that were named, each part's on the way to its parent."""
     path = tree.model.path
@@ -238,7 +295,7 @@ def _chosen_joints(
     return chosen[0], joints
 
 
-def _cut(tree: LinkTree, category: Category, root: str, kept: Sequence[UrdfJoint]) -> PartTree:
+def _cut(tree: _LinkTree, category: Category, root: str, kept: Sequence[UrdfJoint]) -> PartTree:
     """The parts that are left when the kept joints are the only ones that move."""
     model, names = tree.model, frozenset(joint.name for joint in kept)
     heads = [model.root, *(joint.child for joint in kept)]
@@ -249,11 +306,11 @@ def _cut(tree: LinkTree, category: Category, root: str, kept: Sequence[UrdfJoint
     for piece in order:
         for joint in kept:
             ends = piece_of[joint.parent], piece_of[joint.child]
-            for here, there, turned in ((*ends, False), (*ends[::-1], True)):
+            for here, there, reversed_ in ((*ends, False), (*ends[::-1], True)):
                 if here == piece and there not in order:
                     order.append(there)
-                    joints[there] = (joint, here, turned)
-    # Parts in the order of the joints that were asked for; the tree must be the category's.
+                    joints[there] = (joint, here, reversed_)
+    # Parts in the order of the joints that are kept; the tree must be the category's.
     children = sorted(joints, key=lambda piece: kept.index(joints[piece][0]))
     parts = [piece_of[root], *children]
     part_joints = tuple(

@@ -5,13 +5,16 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+from jaxtyping import Float
 
 from caper_jax.geometry.solids import Solid, corners_after_cut
 
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
-def surface_points(solids: list[Solid], count: int, rng: np.random.Generator) -> np.ndarray:
+def surface_points(
+    solids: list[Solid], count: int, rng: np.random.Generator
+) -> Float[np.ndarray, "n 3"]:
     """Points on a union of solids that reach its exact bounds.
 
     Args:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from caper_jax.errors import CaperError
 
@@ -25,22 +26,22 @@ class Mesh:
       faces: [F, 3] indices of vertices.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
 
-    def moved(self, pose: np.ndarray) -> Mesh:
+    def moved(self, pose: Float[np.ndarray, "4 4"]) -> Mesh:
         """This mesh under a pose [4, 4]."""
         return Mesh(self.vertices @ pose[:3, :3].T + pose[:3, 3], self.faces)
 
-    def scaled(self, factor: float | np.ndarray) -> Mesh:
+    def scaled(self, factor: float | Float[np.ndarray, " 3"]) -> Mesh:
         """This mesh with its coordinates multiplied by a factor or by factors [3]."""
         return Mesh(self.vertices * factor, self.faces)
 
-    def bounds(self) -> np.ndarray:
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
         """[2, 3] lowest and highest corner of the axis-aligned box."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
-    def moments(self) -> tuple[float, np.ndarray, np.ndarray]:
+    def moments(self) -> tuple[float, Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:
         """Area, mean [3] and second moments [3, 3] about the mean of the surface, exactly."""
         corners = self.vertices[self.faces]
         edges = corners[:, 1:] - corners[:, :1]
@@ -69,14 +70,12 @@ def read_mesh(path: Path) -> Mesh:
     A Collada file's unit is applied, its up axis is not (as ROS does).
 
     Raises:
-      CaperError: a format or file that cannot be read, or a package that is not installed.
+      CaperError: a format or file that cannot be read, or a .dae file without pycollada.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise CaperError(f"{path}: meshes are read from {', '.join(SUFFIXES)}")
-    try:
-        import trimesh
-    except ImportError:
-        raise CaperError(f"reading meshes {NEEDS_MESH}") from None
+    import trimesh
+
     if path.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
         raise CaperError(f"{path}: reading .dae files needs pycollada: pip install pycollada")
     try:
@@ -113,16 +112,14 @@ def _plain(vertices: Any, faces: Any) -> Mesh:
     return Mesh(vertices[used], faces.reshape(-1, 3))
 
 
-def shape_mesh(geometry: Any, where: str) -> Mesh:
+def primitive_mesh(geometry: Any, where: str) -> Mesh:
     """A URDF box, cylinder (along z) or sphere, centered on its frame.
 
     Raises:
-      CaperError: another shape, or the packages for meshes are not installed.
+      CaperError: another shape.
     """
-    try:
-        import trimesh
-    except ImportError:
-        raise CaperError(f"reading URDF files {NEEDS_MESH}") from None
+    import trimesh
+
     if geometry.box is not None:
         surface = trimesh.creation.box(extents=geometry.box.size)
     elif geometry.cylinder is not None:

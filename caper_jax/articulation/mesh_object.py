@@ -1,4 +1,4 @@
-"""An articulated object in one reference pose: meshes of the parts and joint lines beside them."""
+"""An articulated object made of meshes: its parts and joints in one reference pose."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
-from caper_jax.data.urdf.load import UrdfModel, joint_motion
-from caper_jax.data.urdf.meshes import Mesh, join
-from caper_jax.data.urdf.parts import PartTree
+from caper_jax.articulation.kinematics import (
+    forward_kinematics_float64,
+    joint_transform_float64,
+)
+from caper_jax.geometry.meshes import Mesh
 
 _DIRECTIONS = 48  # of a half circle, over which widths are averaged
 
 
 @dataclass(frozen=True)
-class Reference:
+class MeshObject:
     """Parts and joints in one frame that all parts share in the reference pose; meters.
 
     Attributes:
@@ -30,29 +33,25 @@ class Reference:
     parts: tuple[Mesh, ...]
     kinds: tuple[str, ...]
     parents: tuple[int, ...]
-    axis: np.ndarray
-    pivot: np.ndarray
-    limits: np.ndarray
+    axis: Float[np.ndarray, "J 3"]
+    pivot: Float[np.ndarray, "J 3"]
+    limits: Float[np.ndarray, "J 2"]
 
     @property
     def num_joints(self) -> int:
         return len(self.kinds)
 
-    def poses(self, states: Sequence[float] | np.ndarray) -> np.ndarray:
+    def poses(self, states: Shaped[np.ndarray, " J"]) -> Float[np.ndarray, "K 4 4"]:
         """[K, 4, 4] of the parts in the root's frame, at states from the reference pose."""
-        poses = [np.eye(4)]
-        for joint, parent in enumerate(self.parents):
-            motion = joint_motion(
-                self.kinds[joint], self.axis[joint], self.pivot[joint], states[joint]
-            )
-            poses.append(poses[parent] @ motion)
-        return np.stack(poses)
+        return forward_kinematics_float64(
+            np.eye(4), self.axis, self.pivot, states, self.kinds, self.parents
+        )
 
-    def at(self, states: np.ndarray) -> Reference:
+    def at(self, states: Shaped[np.ndarray, " J"]) -> MeshObject:
         """The same object with another reference pose; states count from there."""
         poses = self.poses(states)
         carriers = poses[list(self.parents)]
-        return Reference(
+        return MeshObject(
             tuple(mesh.moved(pose) for mesh, pose in zip(self.parts, poses, strict=True)),
             self.kinds,
             self.parents,
@@ -61,10 +60,10 @@ class Reference:
             self.limits - np.asarray(states)[:, None],
         )
 
-    def moved(self, pose: np.ndarray, scale: float = 1.0) -> Reference:
+    def moved(self, pose: Float[np.ndarray, "4 4"], scale: float = 1.0) -> MeshObject:
         """In another frame (old -> new [4, 4]), then with all lengths times ``scale``."""
         sliding = np.array([kind == "prismatic" for kind in self.kinds], bool)
-        return Reference(
+        return MeshObject(
             tuple(mesh.moved(pose).scaled(scale) for mesh in self.parts),
             self.kinds,
             self.parents,
@@ -73,17 +72,17 @@ class Reference:
             self.limits * np.where(sliding, scale, 1.0)[:, None],
         )
 
-    def flipped(self, signs: np.ndarray) -> Reference:
-        """With the axes of the joints with sign -1 turned round, and their limits with them."""
+    def flipped(self, signs: Float[np.ndarray, " J"]) -> MeshObject:
+        """With the axes of the joints with sign -1 reversed, and their limits with them."""
         limits = np.where(signs[:, None] < 0, -self.limits[:, ::-1], self.limits)
-        return Reference(
+        return MeshObject(
             self.parts, self.kinds, self.parents, self.axis * signs[:, None], self.pivot, limits
         )
 
-    def ordered(self, order: Sequence[int]) -> Reference:
+    def ordered(self, order: Sequence[int]) -> MeshObject:
         """With joint ``order[j]`` as joint j; for joints that all hang on the root."""
         rows = list(order)
-        return Reference(
+        return MeshObject(
             (self.parts[0], *(self.parts[row + 1] for row in rows)),
             tuple(self.kinds[row] for row in rows),
             self.parents,
@@ -92,25 +91,25 @@ class Reference:
             self.limits[rows],
         )
 
-    def exchanged(self) -> Reference:
+    def exchanged(self) -> MeshObject:
         """Two parts, the other one the root: seen from its child, a joint turns the other way."""
-        return Reference(
+        return MeshObject(
             self.parts[::-1], self.kinds, self.parents, -self.axis, self.pivot, self.limits
         )
 
-    def bounds(self) -> np.ndarray:
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
         """[2, 3] corners of the whole object's box."""
         boxes = np.array([mesh.bounds() for mesh in self.parts])
         return np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
 
-    def across(self, joint: int) -> np.ndarray:
+    def across(self, joint: int) -> Float[np.ndarray, "2 3"]:
         """[2, 3] orthonormal, e1 x e2 = axis: the plane in which a revolute joint turns."""
         axis = self.axis[joint]
         first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
         first /= np.linalg.norm(first)
         return np.stack([first, np.cross(axis, first)])
 
-    def direction(self, part: int, joint: int) -> np.ndarray:
+    def direction(self, part: int, joint: int) -> Float[np.ndarray, " 3"]:
         """[3] unit vector across a joint's axis, away from it, along which a part is longest."""
         plane = self.across(joint)
         _, mean, second = self.parts[part].moments()
@@ -118,7 +117,9 @@ class Reference:
         away = mean - self.pivot[joint]
         return longest if longest @ away >= 0 else -longest
 
-    def turn(self, joint: int, start: np.ndarray, end: np.ndarray) -> float:
+    def turn(
+        self, joint: int, start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"]
+    ) -> float:
         """Angle in (-pi, pi] about a joint's axis from one direction to another."""
         plane = self.across(joint)
         (a, b), (c, d) = plane @ start, plane @ end
@@ -129,7 +130,9 @@ class Reference:
 
         Along a slide; in the plane of a turn, the mean over all directions.
         """
-        motion = joint_motion(self.kinds[joint], self.axis[joint], self.pivot[joint], state)
+        motion = joint_transform_float64(
+            self.kinds[joint], self.axis[joint], self.pivot[joint], state
+        )
         child = self.parts[joint + 1].moved(motion)
         points = np.concatenate([self.parts[self.parents[joint]].vertices, child.vertices])
         if self.kinds[joint] == "prismatic":
@@ -138,30 +141,3 @@ class Reference:
         angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
         directions = np.stack([np.cos(angles), np.sin(angles)], -1) @ self.across(joint)
         return float(np.ptp(points @ directions.T, axis=0).mean())
-
-
-def reference(model: UrdfModel, tree: PartTree) -> Reference:
-    """The object as the file holds it at state 0, in the frame of the file's root link.
-
-    Joints that mimic others stand where ``tree.locked``, and state 0 of the rest, put them.
-    """
-    poses = model.link_poses(tree.locked)
-    parts = []
-    for links in tree.links:
-        meshes = [(model.links[name], poses[name]) for name in links]
-        parts.append(join([mesh.moved(pose) for mesh, pose in meshes if mesh is not None]))
-    axes, pivots, limits = [], [], []
-    for part in tree.joints:
-        frame = poses[part.joint.parent] @ part.joint.origin
-        # Seen from its child, a joint turns the other way.
-        axes.append(frame[:3, :3] @ part.joint.axis * (-1.0 if part.reversed else 1.0))
-        pivots.append(frame[:3, 3])
-        limits.append(part.joint.limits)
-    return Reference(
-        tuple(parts),
-        tuple(part.joint.kind for part in tree.joints),
-        tuple(part.parent for part in tree.joints),
-        np.array(axes),
-        np.array(pivots),
-        np.array(limits),
-    )

@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
 from caper_jax.articulation.kinematics import forward_kinematics
-from caper_jax.data.urdf.export import part_mesh, write_urdf
 from caper_jax.errors import CaperError
 from caper_jax.geometry.solids import bounds, box, cone, cylinder, ellipsoid, frustum
 from caper_jax.synthetic.instances import draw_instances
+from caper_jax.synthetic.urdf_export import part_mesh, write_urdf
 
 NAMES = ("laptop", "drawer", "robotarm")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ pytest.importorskip("trimesh")
 pytest.importorskip("yourdfpy")
 
 import yourdfpy
-from _helpers.solid_meshes import part_mesh
+from _helpers.solid_meshes import mesh_object, part_mesh
 from _helpers.urdf_models import (
     DRAWER_LEVELS,
     DRAWER_SIZE,
@@ -27,13 +28,13 @@ from caper_jax import categories
 from caper_jax.categories.drawer import DRAWER
 from caper_jax.categories.laptop import LAPTOP
 from caper_jax.categories.robotarm import ROBOTARM
-from caper_jax.data.urdf.canonical import ImportOptions, bring, import_urdf
-from caper_jax.data.urdf.export import write_urdf
+from caper_jax.data.urdf import ImportOptions
+from caper_jax.data.urdf.canonical import import_model, import_urdf
 from caper_jax.data.urdf.load import UrdfJoint, UrdfModel, read_urdf
-from caper_jax.data.urdf.meshes import Mesh, join
 from caper_jax.data.urdf.parts import map_parts
-from caper_jax.data.urdf.reference import Reference
+from caper_jax.geometry.meshes import join
 from caper_jax.synthetic.instances import draw_instances
+from caper_jax.synthetic.urdf_export import write_urdf
 
 # Canonical axes -> those of a file with z up and x to the front, as in robotics.
 Z_UP = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], float)
@@ -55,54 +56,67 @@ def fit_rigid(source, target):
 
 
 @pytest.mark.parametrize(
-    ("build", "category"),
-    [(partnet_laptop, LAPTOP), (partnet_drawer, DRAWER), (serial_arm, ROBOTARM)],
+    ("build", "category", "scale"),
+    [(partnet_laptop, LAPTOP, 0.3), (partnet_drawer, DRAWER, 0.5), (serial_arm, ROBOTARM, 1.0)],
 )
-def test_kinematics_are_those_of_the_file(build, category, tmp_path):
-    """Every vertex is where yourdfpy puts it, seen from the root, at any state."""
+def test_joint_values_of_the_file_become_states(build, category, scale, tmp_path):
+    """By the map of the report, every vertex is where yourdfpy puts it, seen from the root."""
     path = build(tmp_path)
     model = read_urdf(path)
-    item = bring(model, category, ImportOptions(rest={"": 0.0}))
+    item = import_model(model, category, ImportOptions(scale=scale))
+    report = json.loads(json.dumps(item.report()))
+    assert list(report["joints"]) == list(category.parts[1:])
+    maps = list(report["joints"].values())
+    names = [joint["file_joint"] for joint in maps]
+    factor, offset = (np.array([joint[key] for joint in maps]) for key in ("factor", "offset"))
     robot = yourdfpy.URDF.load(str(path), load_meshes=False)
     tree = map_parts(model, category, None, {})
-    links = {joint.child: joint.name for joint in model.joints}
-    parts = [list(tree.links[0])]
-    for joint in item.joint_names:
-        parts.append(next(list(p) for p in tree.links if joint in [links.get(n) for n in p]))
+    child = {joint.name: joint.child for joint in model.joints}
+    parts = [tree.links[0], *(next(p for p in tree.links if child[n] in p) for n in names)]
 
-    def in_file(states):
-        """The parts' vertices [V_k, 3] by yourdfpy, and the root's place among them."""
-        robot.update_cfg({**tree.locked, **states})
+    def in_file(values):
+        """The parts' vertices [V_k, 3] by yourdfpy."""
+        robot.update_cfg({**tree.locked, **dict(zip(names, values, strict=True))})
         places = []
-        for names in parts:
-            meshes = [(model.links[n], robot.get_transform(n)) for n in names]
+        for links in parts:
+            meshes = [(model.links[n], robot.get_transform(n)) for n in links]
             places.append(join([m.moved(pose) for m, pose in meshes if m is not None]).vertices)
-        return places
+        return [scale * vertices for vertices in places]
 
-    at_zero = in_file(dict.fromkeys(item.joint_names, 0.0))
-    ours = [part.vertices for part in item.reference.parts]
-    to_canonical = fit_rigid(at_zero[0], ours[0])
+    ours = [part.vertices for part in item.at_rest.parts]
+    at_rest = in_file(-offset / factor)
+    to_canonical = fit_rigid(at_rest[0], ours[0])
+    for part, vertices in zip(ours, at_rest, strict=True):
+        np.testing.assert_allclose(
+            vertices @ to_canonical[:3, :3].T + to_canonical[:3, 3], part, atol=1e-9
+        )
     rng = np.random.default_rng(1)
     for _ in range(5):
-        states = rng.uniform(-1, 1, category.num_joints)
-        signs = np.array(
-            [
-                1.0 if axis @ to_canonical[:3, :3] @ _file_axis(robot, joint) > 0 else -1.0
-                for axis, joint in zip(item.reference.axis, item.joint_names, strict=True)
-            ]
+        values = rng.uniform(-1, 1, category.num_joints)
+        states = factor * values + offset
+        np.testing.assert_allclose(
+            [joint.value(state) for joint, state in zip(item.joints, states, strict=True)],
+            values,
+            atol=1e-12,
         )
-        theirs = in_file(dict(zip(item.joint_names, signs * states, strict=True)))
-        poses = item.reference.poses(states)
-        for pose, rest, moved in zip(poses, ours, theirs, strict=True):
+        theirs = in_file(values)
+        for pose, rest, moved in zip(item.at_rest.poses(states), ours, theirs, strict=True):
             expected = moved @ to_canonical[:3, :3].T + to_canonical[:3, 3]
             np.testing.assert_allclose(rest @ pose[:3, :3].T + pose[:3, 3], expected, atol=1e-9)
 
 
-def _file_axis(robot, joint):
-    """A joint's axis in the frame of the root link at state 0."""
-    element = robot.joint_map[joint]
-    robot.update_cfg(dict.fromkeys(robot.actuated_joint_names, 0.0))
-    return robot.get_transform(element.child)[:3, :3] @ element.axis
+def test_the_report_has_limits_in_the_file_and_here(tmp_path):
+    """A laptop that opens by negative values, with a wider range than the category's."""
+    item = import_urdf(partnet_laptop(tmp_path / "101"), LAPTOP)
+    (joint,) = item.report()["joints"].values()
+    assert (joint["file_joint"], joint["unit"], joint["clipped"]) == ("joint_0", "rad", True)
+    assert joint["factor"] == -1.0
+    np.testing.assert_allclose(np.degrees(joint["offset"]), 20, atol=1e-6)
+    np.testing.assert_allclose(np.degrees(joint["file_limits"]), [-40, 110], atol=1e-6)
+    np.testing.assert_allclose(np.degrees(joint["state_limits"]), [-90, 60], atol=1e-6)
+    np.testing.assert_allclose(np.degrees(joint["state_range"]), [-70, 60], atol=1e-6)
+    arm = import_urdf(serial_arm(tmp_path / "arm"), ROBOTARM).report()["joints"]["link 4"]
+    assert arm["file_limits"] == [None, None] and arm["clipped"]
 
 
 def test_partnet_laptop_by_hand(tmp_path):
@@ -118,8 +132,8 @@ def test_partnet_laptop_by_hand(tmp_path):
     middle = (low + high) / 2
     base, upright = -middle, np.array([0, thick / 2 + height / 2, -depth / 2 - lid / 2]) - middle
     np.testing.assert_allclose(item.box_center, [base, upright], atol=1e-6)
-    np.testing.assert_allclose(item.reference.axis, [[-1, 0, 0]], atol=1e-9)
-    np.testing.assert_allclose(np.degrees(item.reference.limits), [[-90, 60]], atol=1e-6)
+    np.testing.assert_allclose(item.at_rest.axis, [[-1, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(np.degrees(item.at_rest.limits), [[-90, 60]], atol=1e-6)
     # Within the category's own range.
     np.testing.assert_allclose(np.degrees(item.states), [[-70, 60]], atol=1e-6)
     assert any("link_0 (screen)" in note for note in item.notes)
@@ -128,8 +142,8 @@ def test_partnet_laptop_by_hand(tmp_path):
 def test_partnet_drawer_by_hand(tmp_path):
     """Drawers from the bottom up, sliding to +z; door and knob locked and told of."""
     item = import_urdf(partnet_drawer(tmp_path / "7"), DRAWER)
-    assert item.joint_names == ("joint_1", "joint_2", "joint_0")
-    np.testing.assert_allclose(item.reference.axis, np.tile([0, 0, 1], (3, 1)), atol=1e-9)
+    assert [joint.file_joint for joint in item.joints] == ["joint_1", "joint_2", "joint_0"]
+    np.testing.assert_allclose(item.at_rest.axis, np.tile([0, 0, 1], (3, 1)), atol=1e-9)
     np.testing.assert_allclose(item.size[1:3], np.tile(DRAWER_SIZE, (2, 1)), atol=1e-6)
     assert (np.diff(item.box_center[1:, 1]) > 0).all()
     np.testing.assert_allclose(
@@ -169,12 +183,7 @@ def as_urdf(model, category, turn, state):
     """A generated object as a URDF would hold it: axes turned, modeled at a state."""
     pose = np.eye(4)
     pose[:3, :3] = turn
-    meshes = [part_mesh(solids) for solids in model.parts]
-    parts = tuple(Mesh(np.asarray(m.vertices, float), np.asarray(m.faces)) for m in meshes)
-    at_rest = Reference(
-        parts, category.joint_types, category.parents, model.axis, model.pivot, model.limits
-    )
-    there = at_rest.at(state).moved(pose)
+    there = mesh_object(model, category).at(state).moved(pose)
     # A link's frame sits on its joint, as in most files.
     places = np.concatenate([np.zeros((1, 3)), there.pivot])
     links = {}
@@ -214,27 +223,27 @@ def test_frames_and_rest_poses_are_found(name, monkeypatch):
         for turn in (np.eye(3), Z_UP):
             for state in states:
                 urdf = as_urdf(model, category, turn, state)
-                item = bring(urdf, category, ImportOptions())
-                np.testing.assert_allclose(item.reference.axis, model.axis, atol=1e-6)
+                item = import_model(urdf, category, ImportOptions())
+                np.testing.assert_allclose(item.at_rest.axis, model.axis, atol=1e-6)
                 # At the file's own rest exactly; else within what shapes say of an angle.
                 loose = 0.0 if not state.any() else 3.5
                 limits = model.limits
                 if "prismatic" in category.joint_types:
-                    np.testing.assert_allclose(item.reference.limits, limits, atol=1e-9)
+                    np.testing.assert_allclose(item.at_rest.limits, limits, atol=1e-9)
                 else:
-                    off = np.degrees(np.abs(item.reference.limits - limits).max())
+                    off = np.degrees(np.abs(item.at_rest.limits - limits).max())
                     assert off <= loose + 1e-6, (index, off)
                 if not state.any():
-                    np.testing.assert_allclose(item.reference.pivot, _centered(model), atol=1e-6)
+                    np.testing.assert_allclose(item.at_rest.pivot, _centered(model), atol=1e-6)
 
 
 def test_up_is_where_drawers_follow_one_another():
     """Cabinets with y up and the front to x, against the convention of z up."""
     turn = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], float)
     for model in draw_instances(DRAWER, 6, "test", 11):
-        item = bring(as_urdf(model, DRAWER, turn, np.zeros(3)), DRAWER, ImportOptions())
-        np.testing.assert_allclose(item.reference.axis, model.axis, atol=1e-6)
-        np.testing.assert_allclose(item.reference.pivot, _centered(model), atol=0.002)
+        item = import_model(as_urdf(model, DRAWER, turn, np.zeros(3)), DRAWER, ImportOptions())
+        np.testing.assert_allclose(item.at_rest.axis, model.axis, atol=1e-6)
+        np.testing.assert_allclose(item.at_rest.pivot, _centered(model), atol=0.002)
         assert any("y = +y" in note and "up detected" in note for note in item.notes)
 
 
@@ -262,10 +271,10 @@ def test_exported_objects_come_back(name, tmp_path):
     for index, model in enumerate(draw_instances(category, 2, "test", 12)):
         path = write_urdf(tmp_path / str(index), model, category, f"{name}{index}", sections=16)
         item = import_urdf(path, category)
-        np.testing.assert_allclose(item.reference.axis, model.axis, atol=1e-5)
-        np.testing.assert_allclose(item.reference.limits, model.limits, atol=1e-5)
+        np.testing.assert_allclose(item.at_rest.axis, model.axis, atol=1e-5)
+        np.testing.assert_allclose(item.at_rest.limits, model.limits, atol=1e-5)
         boxes = np.array([part_mesh(solids).bounds for solids in model.parts])
         middle = (boxes[:, 0].min(0) + boxes[:, 1].max(0)) / 2
-        np.testing.assert_allclose(item.reference.pivot, model.pivot - middle, atol=1e-5)
+        np.testing.assert_allclose(item.at_rest.pivot, model.pivot - middle, atol=1e-5)
         np.testing.assert_allclose(item.size, np.ptp(boxes, axis=1), atol=1e-5)
         np.testing.assert_allclose(item.box_center, boxes.mean(1) - middle, atol=1e-5)

@@ -10,11 +10,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from caper_jax.articulation.category import Category, ObjectModel
-from caper_jax.data.urdf.meshes import NEEDS_MESH
+from caper_jax.articulation.shapes import centered
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
+from caper_jax.geometry.meshes import NEEDS_MESH
 from caper_jax.geometry.solids import Solid
-from caper_jax.synthetic.instances import centered
 
 SECTIONS = 96  # of a circle
 URDF_FILE = "mobility.urdf"  # its name in PartNet-Mobility
@@ -24,7 +24,7 @@ def _manifold3d() -> Any:
     try:
         import manifold3d
     except ImportError:
-        raise CaperError(f"meshes of generated objects: {NEEDS_MESH}") from None
+        raise CaperError(f"a mesh of a generated object {NEEDS_MESH}") from None
     return manifold3d
 
 
@@ -73,13 +73,11 @@ def part_mesh(solids: list[Solid], sections: int = SECTIONS, united: bool = Fals
       A trimesh.Trimesh; its box is the solids' own (where no hole cuts the outermost points).
 
     Raises:
-      CaperError: trimesh or manifold3d is not installed, or nothing is left of the solids.
+      CaperError: manifold3d is not installed, or nothing is left of the solids.
     """
+    import trimesh
+
     manifold3d = _manifold3d()
-    try:
-        import trimesh
-    except ImportError:
-        raise CaperError(f"meshes of generated objects: {NEEDS_MESH}") from None
     shapes = [_shape(solid, sections) for solid in solids]
     if united:
         shapes = [manifold3d.Manifold.batch_boolean(shapes, manifold3d.OpType.Add)]

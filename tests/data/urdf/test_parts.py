@@ -13,13 +13,14 @@ pytest.importorskip("yourdfpy")
 
 from _helpers.urdf_models import Robot, partnet_drawer, partnet_laptop, serial_arm
 
+from caper_jax.articulation.urdf_rule import UrdfRule
 from caper_jax.categories.drawer import DRAWER
 from caper_jax.categories.eyeglasses import EYEGLASSES
 from caper_jax.categories.laptop import LAPTOP
 from caper_jax.categories.robotarm import ROBOTARM
-from caper_jax.data.urdf.canonical import ImportOptions, bring, import_urdf
-from caper_jax.data.urdf.folders import find_models
-from caper_jax.data.urdf.load import read_urdf
+from caper_jax.data.urdf import ImportOptions
+from caper_jax.data.urdf.canonical import import_model, import_urdf
+from caper_jax.data.urdf.load import find_models, read_urdf
 from caper_jax.data.urdf.parts import map_parts
 from caper_jax.errors import CaperError
 
@@ -145,7 +146,7 @@ def test_what_is_not_geometry_is_left_unread(tmp_path):
     path.write_text(text.replace('<robot name="thing">', "<robot>"))
     model = read_urdf(path)
     assert model.joints[0].limits == (-np.inf, np.inf)
-    item = bring(model, LAPTOP, ImportOptions())
+    item = import_model(model, LAPTOP, ImportOptions())
     np.testing.assert_allclose(item.states, [LAPTOP.joints[0].limits])
 
 
@@ -191,7 +192,7 @@ def test_root_is_the_named_link_and_the_joint_turns_round(tmp_path):
         turned = import_urdf(robot.write(), LAPTOP, options)
         for field in ("axis", "pivot", "limits"):
             np.testing.assert_allclose(
-                getattr(turned.reference, field), getattr(plain.reference, field), atol=1e-9
+                getattr(turned.at_rest, field), getattr(plain.at_rest, field), atol=1e-9
             )
         np.testing.assert_allclose(turned.size, plain.size, atol=1e-9)
         np.testing.assert_allclose(turned.box_center, plain.box_center, atol=1e-9)
@@ -267,33 +268,35 @@ def test_given_frame_rest_and_scale(tmp_path):
     path = two_part(tmp_path).write()
     item = import_urdf(path, LAPTOP)
     np.testing.assert_allclose(item.size, [(0.3, 0.02, 0.2), (0.3, 0.2, 0.02)], atol=1e-9)
-    np.testing.assert_allclose(item.reference.axis, [[-1, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(item.at_rest.axis, [[-1, 0, 0]], atol=1e-12)
     model = read_urdf(path)
-    scaled = bring(model, LAPTOP, ImportOptions(scale=0.5))
+    scaled = import_model(model, LAPTOP, ImportOptions(scale=0.5))
     np.testing.assert_allclose(scaled.size, item.size / 2)
-    np.testing.assert_allclose(scaled.reference.pivot, item.reference.pivot / 2)
-    np.testing.assert_allclose(scaled.reference.limits, item.reference.limits)
-    mean = bring(model, LAPTOP, ImportOptions(scale=None))
+    np.testing.assert_allclose(scaled.at_rest.pivot, item.at_rest.pivot / 2)
+    np.testing.assert_allclose(scaled.at_rest.limits, item.at_rest.limits)
+    mean = import_model(model, LAPTOP, ImportOptions(scale=None))
     low = np.array(LAPTOP.mean_center) - np.array(LAPTOP.mean_size) / 2
     high = np.array(LAPTOP.mean_center) + np.array(LAPTOP.mean_size) / 2
-    whole = np.ptp(mean.reference.bounds(), axis=0)
+    whole = np.ptp(mean.at_rest.bounds(), axis=0)
     assert np.linalg.norm(whole) == pytest.approx(np.linalg.norm(high.max(0) - low.min(0)))
     for rest in ({"": 10.0}, {"hinge": 10.0}, {"lid": 10.0}):
-        leaning = bring(model, LAPTOP, ImportOptions(rest=rest))
-        shift = leaning.reference.limits - item.reference.limits
+        leaning = import_model(model, LAPTOP, ImportOptions(rest=rest))
+        shift = leaning.at_rest.limits - item.at_rest.limits
         # A positive state closes the lid in the file, and opens it here.
         np.testing.assert_allclose(np.degrees(shift), [[10, 10]], atol=1e-9)
     given = ImportOptions(up=np.array([0, 0, 2.0]), front=np.array([0, -1.0, 0]))
-    same = bring(model, LAPTOP, given)
+    same = import_model(model, LAPTOP, given)
     np.testing.assert_allclose(same.box_center, item.box_center, atol=1e-12)
     with pytest.raises(CaperError, match="give both --up and --front"):
-        bring(model, LAPTOP, ImportOptions(up=np.array([0, -1.0, 0])))
+        import_model(model, LAPTOP, ImportOptions(up=np.array([0, -1.0, 0])))
     with pytest.raises(CaperError, match="axis of hinge lies across"):
-        bring(model, LAPTOP, ImportOptions(up=np.array([0, 0, 1.0]), front=np.array([1.0, 0, 0])))
+        import_model(
+            model, LAPTOP, ImportOptions(up=np.array([0, 0, 1.0]), front=np.array([1.0, 0, 0]))
+        )
     with pytest.raises(CaperError, match="--rest: unknown joint 'hing'; did you mean 'hinge'"):
-        bring(model, LAPTOP, ImportOptions(rest={"hing": 0.0}))
+        import_model(model, LAPTOP, ImportOptions(rest={"hing": 0.0}))
     with pytest.raises(CaperError, match=r"turns from .*wrong rest"):
-        bring(model, LAPTOP, ImportOptions(rest={"hinge": 160.0}))
+        import_model(model, LAPTOP, ImportOptions(rest={"hinge": 160.0}))
 
 
 def test_oblique_models_keep_their_hinge(tmp_path):
@@ -304,17 +307,17 @@ def test_oblique_models_keep_their_hinge(tmp_path):
     turned = import_urdf(robot.write(), LAPTOP)
     for field in ("axis", "pivot"):
         np.testing.assert_allclose(
-            getattr(turned.reference, field), getattr(straight.reference, field), atol=1e-9
+            getattr(turned.at_rest, field), getattr(straight.at_rest, field), atol=1e-9
         )
     assert "30 deg off the file's axes" in turned.notes[-2]
 
 
 def test_categories_without_a_rule_take_the_usual_frame(tmp_path):
     """One's own category: at rest at 0, z up, x to the front, the sense of the file."""
-    category = dataclasses.replace(LAPTOP, name="hatch")
+    category = dataclasses.replace(LAPTOP, name="hatch", urdf_rule=UrdfRule())
     item = import_urdf(two_part(tmp_path).write(), category)
-    np.testing.assert_allclose(item.reference.axis, [[0, 0, 1]], atol=1e-12)
-    np.testing.assert_allclose(item.reference.limits, [[-1.5, 1.0]])
+    np.testing.assert_allclose(item.at_rest.axis, [[0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(item.at_rest.limits, [[-1.5, 1.0]])
     np.testing.assert_allclose(item.size, [(0.2, 0.02, 0.3), (0.02, 0.2, 0.3)], atol=1e-9)
 
 
