@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
 
+from caper_jax.articulation.conversions import Conversion
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.geometry.solids import Solid
 
@@ -108,6 +109,7 @@ class Category:
       viewpoint: cameras of generated frames.
       symmetries: declared ambiguities.
       closed: the limit at which a joint is closed; None where that means nothing.
+      datasets: how its objects in public datasets become ours, see ``articulation.conversions``.
     """
 
     name: str
@@ -122,6 +124,8 @@ class Category:
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
     symmetries: tuple[Symmetry, ...] = ()
     closed: Literal["low", "high"] | None = "low"
+    # Not part of what makes categories equal: networks do not see it, and it cannot be hashed.
+    datasets: Mapping[str, Conversion] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def num_parts(self) -> int:

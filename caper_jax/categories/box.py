@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry
+from caper_jax.articulation.conversions import ReArtConversion
 from caper_jax.categories.forms import about
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid, frustum
 
@@ -289,4 +290,15 @@ BOX = Category(
             reason="a case whose lid is as deep as its base may exchange the two",
         ),
     ),
+    datasets={
+        # The lid lies flat open, 180 deg from closed; the hinge is along y, the lid towards -x.
+        "reart": ReArtConversion(
+            1,
+            ("box",),
+            axes=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
+            opening=(0.0, -1.0, 0.0),
+            stored_state=lambda _: np.pi,
+            test_objects=(0, 1),
+        ),
+    },
 )

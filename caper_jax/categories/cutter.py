@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.conversions import ReArtConversion, StoredObject
 from caper_jax.categories.forms import about, along, beam
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid
 
@@ -318,6 +319,15 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     return ObjectModel([handle, blade], _TRAVEL, mouth, limits)
 
 
+def _stored_extension(stored: StoredObject) -> float:
+    """Way (meters) of the tip of a cutter of ReArt-48 beyond the end of the body.
+
+    The files store the blade fully out, towards -y. Retracted, its tip is flush with the body's
+    end.
+    """
+    return float((stored.low[1, 1] - stored.low[0, 1]) / stored.axis[0, 1])
+
+
 CUTTER = Category(
     name="cutter",
     parts=("body", "blade"),
@@ -328,4 +338,14 @@ CUTTER = Category(
     mean_size=((0.141, 0.015, 0.029), (0.114, 0.013, 0.017)),
     mean_center=((0.0, -0.002, 0.0), (0.012, 0.003, 0.0)),
     shape=shape,
+    datasets={
+        "reart": ReArtConversion(
+            3,
+            ("cutter",),
+            axes=((0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)),
+            opening=(0.0, -1.0, 0.0),
+            stored_state=_stored_extension,
+            test_objects=(20, 21),
+        ),
+    },
 )

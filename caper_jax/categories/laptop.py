@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry
+from caper_jax.articulation.conversions import ArtImageConversion, CaptraConversion, Front
 from caper_jax.categories.forms import about
 from caper_jax.geometry.solids import Solid, box, cylinder, frustum
 
@@ -154,6 +155,8 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     return ObjectModel([base, lid], _HINGE, hinge[None], limits)
 
 
+# In the files the lid stands at the back of the base.
+_FRONT = Front("behind", axes=((-1, 0, 0),))
 LAPTOP = Category(
     name="laptop",
     parts=("base", "lid"),
@@ -171,4 +174,10 @@ LAPTOP = Category(
             reason="without a visible keyboard, base and lid are two like plates",
         ),
     ),
+    datasets={
+        "artimage": ArtImageConversion(1, (10040, 10885, 11242, 11030, 11156), _FRONT),
+        "captra": CaptraConversion(
+            "laptop", (10101, 10270, 10356, 11156, 11405, 11581), _FRONT, lower_root=True
+        ),
+    },
 )

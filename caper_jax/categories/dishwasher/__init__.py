@@ -10,6 +10,7 @@ import itertools
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.conversions import ArtImageConversion, Front
 from caper_jax.categories.dishwasher.body import TYPES, Plan, body, controls, draw_plan, inside
 from caper_jax.categories.forms import TURN_X, TURN_Y, Handle, HandleStyle, about, rotated
 from caper_jax.geometry.solids import Solid, box, cylinder, frustum
@@ -160,4 +161,10 @@ DISHWASHER = Category(
     mean_size=((0.543, 0.776, 0.58), (0.532, 0.072, 0.633)),
     mean_center=((0.0, 0.0, -0.302), (0.0, -0.291, 0.276)),
     shape=shape,
+    datasets={
+        # In the files the open door lies ahead of the body.
+        "artimage": ArtImageConversion(
+            3, (11700, 12530, 12559, 12580), Front("ahead", axes=((1, 0, 0),))
+        ),
+    },
 )

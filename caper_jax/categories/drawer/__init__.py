@@ -7,6 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.conversions import (
+    ArtImageConversion,
+    CaptraConversion,
+    Front,
+    NotConvertible,
+)
 from caper_jax.categories.drawer import cabinet
 from caper_jax.categories.drawer.cabinet import Plan
 from caper_jax.categories.forms import TURN_Y, Handle, HandleStyle, StandStyle, stand
@@ -182,6 +188,7 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     return ObjectModel([body, *drawers], np.tile([0.0, 0.0, 1.0], (3, 1)), np.array(pivots), limits)
 
 
+_FRONT = Front("slide", axes=((0, 0, 1),) * 3, sorted_by=1)
 DRAWER = Category(
     name="drawer",
     parts=("body", "drawer1", "drawer2", "drawer3"),
@@ -202,4 +209,11 @@ DRAWER = Category(
         (-0.002, 0.257, 0.031),
     ),
     shape=shape,
+    datasets={
+        "artimage": ArtImageConversion(4, (46123, 45841, 46440), _FRONT),
+        "captra": CaptraConversion("drawers", (46440, 46123), _FRONT),
+        "reart": NotConvertible(
+            "drawers with one drawer each (2 parts), but our category 'drawer' has three (4 parts)"
+        ),
+    },
 )

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.conversions import ArtImageConversion, CaptraConversion, Front
 from caper_jax.categories.eyeglasses import front as fronts
 from caper_jax.categories.forms import about, beam, mirrored
 from caper_jax.geometry.solids import Solid, ellipsoid
@@ -155,6 +156,8 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     )
 
 
+# In the files the temples reach back from the lenses.
+_FRONT = Front("behind", axes=((0, -1, 0), (0, 1, 0)), sorted_by=0)
 EYEGLASSES = Category(
     name="eyeglasses",
     closed="high",
@@ -169,4 +172,12 @@ EYEGLASSES = Category(
     mean_size=((0.134, 0.044, 0.017), (0.009, 0.029, 0.126), (0.009, 0.029, 0.126)),
     mean_center=((0.0, 0.002, 0.062), (-0.063, -0.002, -0.008), (0.063, -0.002, -0.008)),
     shape=shape,
+    datasets={
+        "artimage": ArtImageConversion(2, (101300, 101859, 102586, 102590, 102596, 102612), _FRONT),
+        "captra": CaptraConversion(
+            "glasses",
+            (101839, 101848, 101860, 101326, 101868, 102591, 102596, 103028),
+            _FRONT,
+        ),
+    },
 )
