@@ -8,8 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from caper_jax.data.types import Batch
 from caper_jax.progress import progress
-from caper_jax.synthetic.frames import Batch, Generator
+from caper_jax.synthetic.frames import Generator
 from caper_jax.synthetic.instances import split_key
 from caper_jax.synthetic.videos import VideoGenerator
 
@@ -52,7 +53,10 @@ def collect_frames(
     key = split_key(generator.split, seed)
     batch = collect(generator.batch, key, frames, FRAMES_AT_A_TIME, title)
     prefix = f"{generator.category.name}_{generator.split}"
-    names = [f"{prefix}{instance:04d}_{index:06d}" for index, instance in enumerate(batch.instance)]
+    names = [
+        f"{prefix}{instance:04d}_{index:06d}"
+        for index, instance in enumerate(np.asarray(batch.instance))
+    ]
     return {**vars(batch), "names": names}
 
 

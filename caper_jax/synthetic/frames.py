@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 
@@ -14,6 +13,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.config import GeneratorConfig
+from caper_jax.data.types import Batch
 from caper_jax.geometry.raster_order import grid_raster_order
 from caper_jax.synthetic import masks
 from caper_jax.synthetic import sensor as sensors
@@ -23,28 +23,6 @@ from caper_jax.synthetic.ray_casting import FAR, nearest_part, part_depths, proj
 from caper_jax.synthetic.surroundings import add_clutter, spill_on_table, table_depth
 
 _MARGIN = 0.04  # of the object's projected box, on each side
-
-
-@flax.struct.dataclass
-class Batch:
-    """Labeled frames.
-
-    Attributes:
-      points: [B, N, 3] meters, camera frame, in scan order.
-      labels: [B, N] int32 part of each point, -1 for residue.
-      pose: ArticulatedPose with leading axis B.
-      visible: [B, K] int32 pixels of each part in the mask, before sampling.
-      instance: [B] int32 index into the bank.
-      visibility: [B, K] ``visible`` over the pixels that the part would have if nothing, neither
-        another part nor something else, were in front of it; None unless measured.
-    """
-
-    points: Any
-    labels: Any
-    pose: ArticulatedPose
-    visible: Any
-    instance: Any
-    visibility: Any = None
 
 
 def systematic(key, hit, count: int):

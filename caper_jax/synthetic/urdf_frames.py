@@ -16,12 +16,13 @@ import numpy as np
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.data.types import Batch
 from caper_jax.data.urdf.canonical import ImportedObject
 from caper_jax.data.urdf.meshes import NEEDS_MESH, Mesh
 from caper_jax.errors import CaperError
 from caper_jax.geometry.raster_order import grid_raster_order
 from caper_jax.synthetic import sensor as sensors
-from caper_jax.synthetic.frames import Batch, Keys, draw_state_and_poses
+from caper_jax.synthetic.frames import Keys, draw_state_and_poses
 from caper_jax.synthetic.instances import InstanceBank, split_key
 
 
