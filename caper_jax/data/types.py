@@ -26,7 +26,8 @@ _KINEMATICS_TOLERANCE_M = 1e-3
 _ROTATION_TOLERANCE = 1e-3
 _MAX_DISTANCE_M = 50.0
 
-Array = jax.Array | np.ndarray
+# numpy or JAX arrays: the same container serves files, the generator and the networks.
+Array = Any
 
 
 class NoFramesError(CaperError):
