@@ -61,6 +61,12 @@ def test_arrays_whose_axes_changed_places(tmp_path, protocol):
     assert_same(safe_pickle.load(path), arrays)
 
 
+def test_ordered_dictionaries(tmp_path):
+    path = tmp_path / "a.pkl"
+    path.write_bytes(pickle.dumps(collections.OrderedDict(b=1, a=2)))
+    assert list(safe_pickle.load(path).items()) == [("b", 1), ("a", 2)]
+
+
 def test_names_of_older_numpy(tmp_path):
     path = tmp_path / "a.pkl"
     text = pickle.dumps(np.arange(3.0), 2)

@@ -86,7 +86,7 @@ def open_dataset(
     on_broken: Callable[[CaperError], None] | None = None,
     **options: Any,
 ) -> DatasetReader:
-    """Opens a dataset; frames are read when asked for.
+    """Opens a dataset; a frame is read when it is indexed.
 
     Args:
       format: one of ``formats()``; "caper" is one HDF5 file of this project, "folder" depth images
