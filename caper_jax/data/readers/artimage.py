@@ -19,7 +19,6 @@ that moves in the video.
 from __future__ import annotations
 
 import re
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -156,18 +155,6 @@ class PmVideosDataset(ArtImageDataset):
     def list_frames(self) -> dict[str, Path]:
         paths = self._home.glob(self._annotations)
         return in_natural_order({f"{path.parent.parent.name}/{path.stem}": path for path in paths})
-
-    def frames_of_line(self, line: str) -> list[str] | None:
-        """A line may name a frame of one video, or of every video that has one of this name."""
-        name = line.removesuffix(".json")
-        return super().frames_of_line(line) or self._names_of_file.get(name)
-
-    @cached_property
-    def _names_of_file(self) -> dict[str, list[str]]:
-        names: dict[str, list[str]] = {}
-        for name in self._files:
-            names.setdefault(name.rpartition("/")[2], []).append(name)
-        return names
 
     def moving_part(self, index: int) -> int | None:
         """The part that moves in the video of frame ``index`` (``sort_part``); None if not stated.

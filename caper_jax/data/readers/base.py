@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -159,9 +159,22 @@ class DatasetReader(ABC):
         """One frame; CaperError, which names the file and the field, for a broken one."""
 
     def frames_of_line(self, line: str) -> list[str] | None:
-        """Names of the frames that a line of a split's file means; None if it means none at all."""
+        """Names of the frames that a line of a split's file means; None if it means none at all.
+
+        Of videos, a line may name a frame of one, or of every video that has one of this name.
+        """
         name = line.removesuffix(".json")
-        return [name] if name in self._files else None
+        if name in self._files:
+            return [name]
+        return self._names_of_videos.get(name) if self.has_videos else None
+
+    @cached_property
+    def _names_of_videos(self) -> dict[str, list[str]]:
+        """Bare names of frames -> the frames of that name, in any video."""
+        names: dict[str, list[str]] = {}
+        for name in self._files:
+            names.setdefault(name.rpartition("/")[2], []).append(name)
+        return names
 
     def object_of(self, path: Path) -> str:
         """Name of the object that a frame of ``list_frames`` shows, for official splits."""

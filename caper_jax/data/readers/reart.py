@@ -274,12 +274,6 @@ class ReArtVideosDataset(_ReArtReader):
         paths = self._annotations.glob("*/*.json")
         return in_natural_order({f"{path.parent.name}/{path.stem}": path for path in paths})
 
-    def frames_of_line(self, line: str) -> list[str] | None:
-        """A line may name a frame of one video, or of every video that has one of this name."""
-        name = line.removesuffix(".json")
-        alike = [other for other, path in self._files.items() if path.stem == name]
-        return super().frames_of_line(line) or alike or None
-
     def object_of(self, path: Path) -> str:
         return object_named_in(path)
 
