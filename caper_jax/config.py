@@ -261,7 +261,7 @@ class LoaderConfig:
     """How a dataset is fed to training.
 
     Attributes:
-      format: layout of the data (``data.readers.FORMATS``).
+      format: layout of the data (``data.readers.formats(labeled=True)``).
       root: file or folder.
       split: split to train on; none for all there is.
       workers: threads that read ahead.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
 
+from caper_jax.articulation.conversions import Conversion
 from caper_jax.articulation.urdf_rule import UrdfRule
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.geometry.solids import Solid
@@ -112,7 +113,7 @@ class Category:
       closed: the limit at which a joint is closed; None where that means nothing.
       urdf_rule: how objects in URDF files become this category's; no rule takes the file's state 0
         as the rest pose, z as up and x as the front.
-      artimage_id: its number in ArtImage's annotations, 0 where it has none.
+      datasets: how its objects in public datasets become ours, see ``articulation.conversions``.
     """
 
     name: str
@@ -129,7 +130,8 @@ class Category:
     closed: Literal["low", "high"] | None = "low"
     # Compiled functions do not depend on it: it is no part of equality or of the hash.
     urdf_rule: UrdfRule = field(default_factory=UrdfRule, compare=False)
-    artimage_id: int = 0
+    # Not part of what makes categories equal: networks do not see it, and it cannot be hashed.
+    datasets: Mapping[str, Conversion] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def num_parts(self) -> int:

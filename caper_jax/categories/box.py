@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry
+from caper_jax.articulation.conversions import ReArtConversion
 from caper_jax.articulation.urdf_rule import (
     UrdfRule,
     X,
@@ -303,4 +304,15 @@ BOX = Category(
         child_words=("lid", "cover"),
         partnet_classes=("Box",),
     ),
+    datasets={
+        # The lid lies flat open, 180 deg from closed; the hinge is along y, the lid towards -x.
+        "reart": ReArtConversion(
+            1,
+            ("box",),
+            axes=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
+            opening=(0.0, -1.0, 0.0),
+            stored_state=lambda _: np.pi,
+            test_objects=(0, 1),
+        ),
+    },
 )

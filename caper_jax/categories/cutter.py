@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.conversions import ReArtConversion, StoredObject
 from caper_jax.articulation.mesh_object import MeshObject
 from caper_jax.articulation.urdf_rule import (
     CanonicalAxes,
@@ -353,6 +354,15 @@ def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
     return CanonicalAxes(up, np.cross(travel, up))
 
 
+def _stored_extension(stored: StoredObject) -> float:
+    """Way (meters) of the tip of a cutter of ReArt-48 beyond the end of the body.
+
+    The files store the blade fully out, towards -y. Retracted, its tip is flush with the body's
+    end.
+    """
+    return float((stored.low[1, 1] - stored.low[0, 1]) / stored.axis[0, 1])
+
+
 CUTTER = Category(
     name="cutter",
     parts=("body", "blade"),
@@ -369,4 +379,14 @@ CUTTER = Category(
         opening=opens_along(X),
         partnet_classes=("Knife",),
     ),
+    datasets={
+        "reart": ReArtConversion(
+            3,
+            ("cutter",),
+            axes=((0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)),
+            opening=(0.0, -1.0, 0.0),
+            stored_state=_stored_extension,
+            test_objects=(20, 21),
+        ),
+    },
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry
+from caper_jax.articulation.conversions import ArtImageConversion, CaptraConversion, Front
 from caper_jax.articulation.mesh_object import MeshObject
 from caper_jax.articulation.urdf_rule import (
     CanonicalAxes,
@@ -181,6 +182,8 @@ def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
     return CanonicalAxes(ref.direction(1, 0), level(ref.direction(0, 0)))
 
 
+# In the files the lid stands at the back of the base.
+_FRONT = Front("behind", axes=((-1, 0, 0),))
 LAPTOP = Category(
     name="laptop",
     parts=("base", "lid"),
@@ -205,5 +208,10 @@ LAPTOP = Category(
         child_words=("screen", "lid", "display", "monitor"),
         partnet_classes=("Laptop",),
     ),
-    artimage_id=1,
+    datasets={
+        "artimage": ArtImageConversion(1, (10040, 10885, 11242, 11030, 11156), _FRONT),
+        "captra": CaptraConversion(
+            "laptop", (10101, 10270, 10356, 11156, 11405, 11581), _FRONT, lower_root=True
+        ),
+    },
 )

@@ -153,8 +153,8 @@ def _observe(arguments: argparse.Namespace) -> _Observation:
         points = read_points(arguments.points)
         return _Observation(sample_points(points, NUM_POINTS, where=str(arguments.points)))
 
+    from caper_jax.data.clouds import mask_from_box
     from caper_jax.data.images import read_depth, read_intrinsics, read_mask
-    from caper_jax.data.plane import mask_from_box
 
     if arguments.mask is None and arguments.box is None:
         raise CaperError("--depth needs --mask or --box to say where the object is")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from caper_jax.cli import common
-from caper_jax.data.readers import FORMATS
+from caper_jax.data.readers import formats
 from caper_jax.errors import CaperError
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--format",
         default="caper",
-        help=f"layout of the data: {', '.join(FORMATS)} (default: caper)",
+        help=f"layout of the data: {', '.join(formats(labeled=True))} (default: caper)",
     )
     common.add_splits(parser)
     parser.add_argument(

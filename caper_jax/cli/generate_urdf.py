@@ -164,7 +164,7 @@ def write_urdf_frames(arguments: argparse.Namespace) -> None:
         **vars(batch),
         names=[
             f"{category.name}_{objects[which].name}_{index:06d}"
-            for index, which in enumerate(batch.instance)
+            for index, which in enumerate(np.asarray(batch.instance))
         ],
         attributes={
             "generator": __version__,

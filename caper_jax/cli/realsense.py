@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from caper_jax.cli import common
-from caper_jax.data.clouds import cloud_from_depth
+from caper_jax.data.clouds import cloud_from_depth, mask_from_box
 from caper_jax.data.live import pack_frame
-from caper_jax.data.plane import mask_from_box
 from caper_jax.errors import CaperError
 
 NUM_POINTS = 1024

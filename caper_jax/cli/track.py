@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from caper_jax.cli import common
+from caper_jax.data.readers import formats
 from caper_jax.errors import CaperError
 
-VIDEO_FORMATS = ("caper", "captra", "folder", "pm-videos", "reart-videos")
 # Options of recorded videos, by the attribute that argparse gives them.
 _RECORDED = (
     "format", "split", "official_split", "depth_scale", "video", "limit", "given_masks", "out",
@@ -56,8 +56,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--format",
-        help=f"layout of the data: {', '.join(VIDEO_FORMATS)} (default: caper for .h5, folder for "
-        "a folder with depth/)",
+        help=f"layout of the data: {', '.join(formats(videos=True))} (default: caper for "
+        ".h5, folder for a folder with depth/)",
     )
     common.add_splits(parser)
     parser.add_argument(

@@ -12,11 +12,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from caper_jax.cli.track import VIDEO_FORMATS
 from caper_jax.config import to_dict
-from caper_jax.data.readers import open_dataset
+from caper_jax.data.readers import formats, open_dataset
 from caper_jax.data.readers.depth_folder import FORMAT as FOLDER
-from caper_jax.data.readers.depth_folder import DepthFolder, is_depth_folder
+from caper_jax.data.readers.depth_folder import is_depth_folder
 from caper_jax.data.types import Dataset, Frame
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.estimator import load
@@ -80,20 +79,19 @@ def open_videos(
         go with it, or a video that it does not hold.
     """
     layout = arguments.format or _guess_format(arguments.data)
-    if layout not in VIDEO_FORMATS:
-        raise unknown_name("format of videos", layout, VIDEO_FORMATS)
-    dataset: Dataset
-    if layout == FOLDER:
-        if arguments.split is not None or arguments.official_split:
-            raise CaperError("--split and --official-split: a folder of depth images has no splits")
-        dataset = DepthFolder(arguments.data, category, depth_scale=arguments.depth_scale)
-    else:
-        if arguments.depth_scale is not None:
-            raise CaperError(f"--depth-scale goes with --format {FOLDER}, not {layout}")
-        dataset = open_dataset(
-            layout, arguments.data, category, arguments.split, arguments.official_split
-        )
-    videos: dict[str, list[int]] = dataset.videos()  # type: ignore[attr-defined]
+    if layout not in formats(videos=True):
+        raise unknown_name("format of videos", layout, formats(videos=True))
+    if layout != FOLDER and arguments.depth_scale is not None:
+        raise CaperError(f"--depth-scale goes with --format {FOLDER}, not {layout}")
+    dataset = open_dataset(
+        layout,
+        arguments.data,
+        category,
+        arguments.split,
+        arguments.official_split,
+        **({"depth_scale": arguments.depth_scale} if layout == FOLDER else {}),
+    )
+    videos = dataset.videos()
     if not videos:
         raise CaperError(
             f"{arguments.data}: holds single frames, no videos; measure them with caper evaluate"
@@ -112,7 +110,7 @@ def _guess_format(data: Path) -> str:
         return "caper"
     if is_depth_folder(data):
         return FOLDER
-    raise CaperError(f"--data {data}: give --format, one of {', '.join(VIDEO_FORMATS)}")
+    raise CaperError(f"--data {data}: give --format, one of {', '.join(formats(videos=True))}")
 
 
 def track_all(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from caper_jax.cli import common
-from caper_jax.data.readers import FORMATS
+from caper_jax.data.readers import formats
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
 
@@ -34,7 +34,9 @@ def build_parser() -> argparse.ArgumentParser:
             ("--format reartmix --data ReArtMix --category box --json box.json", "for programs"),
         ],
     )
-    parser.add_argument("--format", required=True, help=f"layout of the data: {', '.join(FORMATS)}")
+    parser.add_argument(
+        "--format", required=True, help=f"layout of the data: {', '.join(formats(labeled=True))}"
+    )
     parser.add_argument("--data", required=True, type=Path, help="dataset's root folder or .h5")
     parser.add_argument("--category", help="check this one only (default: all that are found)")
     parser.add_argument("--split", help="check frames of this split only (default: all frames)")

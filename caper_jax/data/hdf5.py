@@ -7,10 +7,10 @@ of float32 at a largest error of 0.01 mm for objects below 0.6 m, where float16 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -18,13 +18,14 @@ import numpy as np
 from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.types import Frame, pose_problems, pose_shapes
+from caper_jax.data.images import check_values
+from caper_jax.data.readers.base import DatasetReader, Schema
+from caper_jax.data.types import Frame, array_problem, pose_problems, pose_shapes
 from caper_jax.errors import CaperError
 
 FORMAT = "caper"
 FORMAT_VERSION = 1
 _LEVELS = 32767
-_REQUIRED = ("format", "format_version", "category", "split", "mask_source", "units")
 # Fields that a file may lack, and their types.
 _OPTIONAL = {"visibility": "f4", "video": "i4", "frame": "i4", "instance": "i4"}
 
@@ -127,12 +128,10 @@ def check_writable(path: str | Path, overwrite: bool = False) -> None:
         raise CaperError(f"{path}: no permission to write in {path.parent}")
 
 
-class Hdf5Dataset:
+class Hdf5Dataset(DatasetReader):
     """Frames of one file written by ``write``; the whole file is read into memory at once.
 
     Attributes:
-      category, format, split, mask_source, names: see ``Dataset``.
-      checked: every array was checked on opening; see ``Loader``.
       video, frame: [F] int32 number of the video and of the frame in it; None when the file holds
         single frames.
       instance: [F] int32 number of the object shown; None when unknown.
@@ -140,21 +139,36 @@ class Hdf5Dataset:
     """
 
     format = FORMAT
+    title = FORMAT
+    has_videos = True
     checked = True
 
-    def __init__(self, path: str | Path, category: str | None = None, split: str | None = None):
+    def __init__(
+        self,
+        root: str | Path,
+        category: str | None = None,
+        split: str | None = None,
+        num_points: int | None = None,
+        official_split: bool = False,
+        on_broken: Callable[[CaperError], None] | None = None,
+    ):
         """Reads and checks the file.
 
         Args:
-          path: the file.
+          root: the file.
           category: name the file must have, or None to take the file's.
           split: name the file must have, or None to take the file's.
+          num_points: not used, the file has its own number.
+          official_split: a file of ours has none.
+          on_broken: not used, there is one file.
 
         Raises:
           CaperError: no such file, truncated or corrupted (names the field), another format,
             category or split, or arrays that break the conventions.
         """
-        path = Path(path)
+        if official_split:
+            self._check_official()
+        path = self.root = Path(root)
         with _opened(path) as file:
             self.attributes = _read_attributes(path, file)
             for key, wanted in (("category", category), ("split", split)):
@@ -162,33 +176,32 @@ class Hdf5Dataset:
                     raise CaperError(
                         f"{path}: holds {key} {self.attributes[key]!r}, not {wanted!r}"
                     )
-            self.category = categories.registered(str(self.attributes["category"]))
+            self.category = categories.registered(self.attributes["category"])
             keys = [*_fields(self.category), *(key for key in _OPTIONAL if key in file)]
             arrays = {key: _read(path, file, key) for key in keys}
         _check_arrays(str(path), arrays, self.category)
-        self.split = str(self.attributes["split"])
-        self.mask_source = str(self.attributes["mask_source"])
+        self.split = self.attributes["split"]
+        self.mask_source = self.attributes["mask_source"]
         self.names: Sequence[str] = [name.decode() for name in arrays.pop("name")]
         self.video, self.frame, self.instance = (
             arrays.pop(key, None) for key in ("video", "frame", "instance")
         )
         self._arrays = arrays
 
-    @staticmethod
-    def categories_in(path: Path) -> list[str]:
-        """The category that a file holds.
+    @classmethod
+    def categories_in(cls, root: Path) -> list[str]:
+        """The category that a file holds; CaperError for one that is not registered."""
+        with _opened(root) as file:
+            return [categories.registered(_read_attributes(root, file)["category"]).name]
 
-        Raises:
-          CaperError: truncated, not of this format, or of a category that is not registered.
-        """
-        with _opened(path) as file:
-            return [categories.registered(str(_read_attributes(path, file)["category"])).name]
-
-    @staticmethod
-    def splits_in(path: Path, category: str) -> list[str]:
+    @classmethod
+    def splits_in(cls, root: Path, category: Category) -> list[str]:
         """The split that a file holds."""
-        with _opened(path) as file:
-            return [str(_read_attributes(path, file)["split"])]
+        with _opened(root) as file:
+            return [_read_attributes(root, file)["split"]]
+
+    def list_frames(self) -> dict[str, Path]:
+        return dict.fromkeys(self.names, self.root)
 
     def videos(self) -> dict[str, list[int]]:
         """Name of every video -> indices of its frames, in the order of time; {} for frames."""
@@ -216,6 +229,9 @@ class Hdf5Dataset:
             instance=None if self.instance is None else str(self.instance[index]),
         )
 
+    def read_frame(self, name: str, path: Path) -> Frame:
+        return self[list(self.names).index(name)]
+
 
 @contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
@@ -237,19 +253,23 @@ def _opened(path: Path) -> Iterator[h5py.File]:
         raise CaperError(f"{path}: corrupted HDF5 file ({error})") from error
 
 
+class _Attributes(Schema):
+    """What every file of this format says about itself."""
+
+    format: Literal["caper"]
+    format_version: Literal[1]
+    category: str
+    split: str
+    mask_source: str
+    units: str
+
+
 def _read_attributes(path: Path, file: h5py.File) -> dict[str, Any]:
     """What the file says about itself; CaperError where it is not of this format."""
     facts = {key: _plain(value) for key, value in file.attrs.items()}
-    missing = [key for key in _REQUIRED if key not in facts]
-    if missing:
-        raise CaperError(
-            f"{path}: lacks the attribute {missing[0]!r}; not a file of format {FORMAT!r}"
-        )
-    if facts["format"] != FORMAT or facts["format_version"] != FORMAT_VERSION:
-        raise CaperError(
-            f"{path}: format {facts['format']!r} version {facts['format_version']}, this "
-            f"program reads {FORMAT!r} version {FORMAT_VERSION}; generate the file again"
-        )
+    check_values(
+        _Attributes, facts, f"{path}: no file of format {FORMAT!r} version {FORMAT_VERSION}"
+    )
     return facts
 
 
@@ -278,25 +298,20 @@ def _check_arrays(where: str, arrays: dict[str, np.ndarray], category: Category)
     """Shapes, dtypes, ranges and conventions of a whole file; names every bad field."""
     frames, num_points = (*arrays["points"].shape, 0, 0)[:2]
     parts = category.num_parts
-    expected: dict[str, tuple[tuple[int, ...], str]] = {
-        "points": ((frames, num_points, 3), "i2"),
-        "points_mean": ((frames, 1, 3), "f4"),
-        "points_scale": ((frames, 1, 1), "f4"),
-        "labels": ((frames, num_points), "i1"),
-        "visible": ((frames, parts), "i4"),
+    expected: dict[str, tuple[Any, ...]] = {  # shape, dtype and range
+        "points": ((frames, num_points, 3), np.int16),
+        "points_mean": ((frames, 1, 3), np.float32),
+        "points_scale": ((frames, 1, 1), np.float32),
+        "labels": ((frames, num_points), np.int8, -1, parts - 1),
+        "visible": ((frames, parts), np.int32, 0),
+        "visibility": ((frames, parts), np.float32, 0, 1),
+        "video": ((frames,), np.int32, 0),
+        "frame": ((frames,), np.int32, 0),
+        "instance": ((frames,), np.int32),
+        **{key: ((frames, *shape), np.float32) for key, shape in pose_shapes(parts).items()},
     }
-    for key, kind in _OPTIONAL.items():
-        if key in arrays:
-            expected[key] = ((frames, parts) if key == "visibility" else (frames,), kind)
-    problems = []
-    for key, (shape, kind) in expected.items():
-        array = arrays[key]
-        if array.shape != shape or array.dtype != np.dtype(kind):
-            problems.append(
-                f"{key} is {array.dtype} {array.shape}, expected {np.dtype(kind)} {shape}"
-            )
-        elif kind == "f4" and not np.isfinite(array).all():
-            problems.append(f"{key} has NaN or infinite entries")
+    checks = [array_problem(key, arrays[key], *expected[key]) for key in expected if key in arrays]
+    problems = [problem for problem in checks if problem is not None]
     names = arrays["name"]
     if names.shape != (frames,) or names.dtype.kind != "S":
         problems.append(f"name is {names.dtype} {names.shape}, expected bytes ({frames},)")
@@ -308,19 +323,9 @@ def _check_arrays(where: str, arrays: dict[str, np.ndarray], category: Category)
         except UnicodeDecodeError:
             problems.append("name is not UTF-8")
     if not problems:
-        if ((arrays["labels"] < -1) | (arrays["labels"] >= parts)).any():
-            problems.append(f"labels must be -1 (unknown) to {parts - 1}")
-        if (arrays["visible"] < 0).any():
-            problems.append("visible must not be negative")
-        visibility = arrays.get("visibility", np.zeros(1))
-        if (visibility < 0).any() or (visibility > 1).any():
-            problems.append("visibility must be fractions from 0 to 1")
         problems += _video_problems(arrays)
-        problems += pose_problems(
-            ArticulatedPose(**{key: arrays[key] for key in pose_shapes(parts)}), category
-        )
-        if len(arrays["rotation"]) != frames:
-            problems.append(f"rotation has {len(arrays['rotation'])} frames, points {frames}")
+        pose = ArticulatedPose(**{key: arrays[key] for key in pose_shapes(parts)})
+        problems += pose_problems(pose, category)
     if problems:
         raise CaperError(f"{where}: {'; '.join(problems)}")
 
@@ -330,8 +335,6 @@ def _video_problems(arrays: dict[str, np.ndarray]) -> list[str]:
         return ["video and frame must be given together"]
     if "video" in arrays:
         pairs = np.stack([arrays["video"], arrays["frame"]], axis=1)
-        if (pairs < 0).any():
-            return ["video and frame must not be negative"]
         if len(np.unique(pairs, axis=0)) < len(pairs):
             return ["video and frame name a frame twice"]
     return []

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32
 from PIL import Image, UnidentifiedImageError
 
 from caper_jax.errors import CaperError
@@ -15,8 +19,11 @@ _MILLIMETER = 1e-3
 # No depth camera sees objects nearer than 2 cm, or resolves one beyond 50 m.
 _NEAREST_M, _FARTHEST_M = 0.02, 50.0
 
+Schema = TypeVar("Schema")
+_TYPE = re.compile(r"int|float|str|list\[.*\]")
 
-def read_depth(path: str | Path, scale: float | None = None) -> np.ndarray:
+
+def read_depth(path: str | Path, scale: float | None = None) -> Float32[np.ndarray, "H W"]:
     """Reads a depth image.
 
     Integer images (16-bit PNG, integer ``.npy``) hold millimeters, float images (``.npy``, TIFF)
@@ -98,7 +105,7 @@ def _check_range(path: str | Path, median: float, integer: bool, scale: float | 
     raise CaperError(f"{path}: median depth would be {median:.3g} m; {advice}")
 
 
-def read_mask(path: str | Path, allow_empty: bool = False) -> np.ndarray:
+def read_mask(path: str | Path, allow_empty: bool = False) -> Bool[np.ndarray, "H W"]:
     """Reads the mask of one object: everything that is not black.
 
     Args:
@@ -128,7 +135,7 @@ def read_mask(path: str | Path, allow_empty: bool = False) -> np.ndarray:
     return mask
 
 
-def read_labels(path: str | Path) -> np.ndarray:
+def read_labels(path: str | Path) -> Int32[np.ndarray, "H W"]:
     """Reads an image of labels: one integer per pixel, as stored.
 
     Args:
@@ -177,10 +184,10 @@ def _file(path: str | Path) -> Path:
     """The path of a file that exists; CaperError without one."""
     path = Path(path)
     try:
-        found = path.is_file()
+        exists = path.is_file()
     except OSError as error:  # a name that is too long, a folder that may not be entered
         raise CaperError(f"{path}: cannot be read ({error.strerror})") from error
-    if not found:
+    if not exists:
         raise CaperError(f"{path}: no such file")
     return path
 
@@ -205,7 +212,87 @@ def read_json(path: str | Path) -> Any:
         raise CaperError(f"{path}: cannot be read as JSON ({error})") from error
 
 
-def read_intrinsics(path: str | Path, image_shape: tuple[int, int] | None = None) -> np.ndarray:
+def read_json_as(path: str | Path, schema: type[Schema]) -> Schema:
+    """The content of a JSON file, checked by pydantic.
+
+    Args:
+      path: the file.
+      schema: a dataclass, a pydantic model, or another type that pydantic understands.
+
+    Raises:
+      CaperError: missing or broken file, or content that does not fit; names file and field.
+    """
+    from pydantic import ValidationError  # 0.1 s that ``import caper_jax`` spares
+
+    try:
+        return _adapter_of(cast(Any, schema)).validate_json(_file(path).read_bytes())
+    except OSError as error:
+        raise CaperError(f"{path}: cannot be read ({error})") from error
+    except ValidationError as error:
+        raise CaperError(f"{path}: {_first_problem(error.errors()[0])}") from error
+
+
+def check_values(schema: type[Schema], values: Any, where: str) -> Schema:
+    """Values from outside as a schema.
+
+    Args:
+      schema: see ``read_json_as``; no dataclass.
+      values: what was read.
+      where: file and place in it, which begin the message.
+
+    Raises:
+      CaperError: names the first field that does not fit, and why.
+    """
+    from pydantic import ValidationError
+
+    try:
+        return _adapter_of(cast(Any, schema)).validate_python(values)
+    except ValidationError as error:
+        raise CaperError(f"{where}: {_first_problem(error.errors()[0])}") from error
+
+
+@cache
+def _adapter_of(schema: Any) -> Any:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(schema)
+
+
+def _first_problem(problem: Any) -> str:
+    """What pydantic says of a field, in one line."""
+    *parents, name = problem["loc"] or ("the content",)
+    if problem["type"] == "json_invalid":
+        return f"broken JSON ({problem['ctx']['error']})"
+    if problem["type"] == "missing":
+        return f"{'.'.join(map(str, parents)) or 'it'} lacks {name!r}"
+    # Of alternatives such as ``int | str``, pydantic adds the type that it tried.
+    field = ".".join(str(part) for part in (*parents, name) if not _TYPE.fullmatch(str(part)))
+    reason = re.sub(r"^(Input|List|Tuple|String|Dictionary) should", "must", problem["msg"])
+    value = repr(problem["input"])
+    value = value if len(value) <= 60 else f"{value[:57]}..."
+    return f"{field}: {reason.removeprefix('Value error, ')}, got {value}"
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """The ways in which files give a pinhole camera; pixels."""
+
+    __pydantic_config__ = {"strict": True, "allow_inf_nan": False}  # noqa: RUF012
+
+    fx: float | None = None
+    fy: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    intrinsic_matrix: list[float | list[float]] | None = None
+    K: list[float | list[float]] | None = None
+    camera_matrix: list[float | list[float]] | None = None
+    width: int | None = None
+    height: int | None = None
+
+
+def read_intrinsics(
+    path: str | Path, image_shape: tuple[int, int] | None = None
+) -> Float64[np.ndarray, "3 3"]:
     """Reads the camera matrix of a pinhole camera.
 
     Args:
@@ -216,49 +303,53 @@ def read_intrinsics(path: str | Path, image_shape: tuple[int, int] | None = None
         where the file states them.
 
     Returns:
-      [3, 3] float64 ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``, pixels.
+      [3, 3] ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``, pixels.
 
     Raises:
       CaperError: missing or broken file, none of these layouts, a transposed matrix, focal lengths
         that are not positive, or another image size.
     """
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise CaperError(f"{path}: expected a JSON object with fx, fy, cx, cy or a matrix")
-    if "intrinsic_matrix" in content:
-        key, by_column = "intrinsic_matrix", True
-        matrix = _numbers(path, key, content[key]).reshape(3, 3).T
-    elif "fx" in content:
-        key, by_column = "fx, fy, cx, cy", False
-        missing = [name for name in ("fx", "fy", "cx", "cy") if name not in content]
-        if missing:
-            raise CaperError(f"{path}: has fx but lacks {', '.join(missing)}")
-        fx, fy, cx, cy = (_number(path, name, content[name]) for name in ("fx", "fy", "cx", "cy"))
-        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    camera = read_json_as(path, _Camera)
+    numbers = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    missing = [name for name, value in numbers.items() if value is None]
+    given = [key for key in ("intrinsic_matrix", "K", "camera_matrix") if getattr(camera, key)]
+    if given:
+        key = given[0]
+        matrix = _matrix(path, key, getattr(camera, key))
+        if key == "intrinsic_matrix":
+            matrix = matrix.T
+    elif not missing:
+        key = "fx, fy, cx, cy"
+        matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], float)
+    elif len(missing) < len(numbers):
+        raise CaperError(f"{path}: lacks {', '.join(missing)} of fx, fy, cx, cy")
     else:
-        found = [name for name in ("K", "camera_matrix") if name in content]
-        if not found:
-            raise CaperError(
-                f"{path}: no camera matrix; expected the keys fx, fy, cx, cy, or "
-                f"intrinsic_matrix, K or camera_matrix, found {sorted(content)}"
-            )
-        key, by_column = found[0], False
-        matrix = _numbers(path, key, content[key]).reshape(3, 3)
-    _check_matrix(path, key, matrix, by_column)
-    if image_shape is not None and "width" in content and "height" in content:
+        raise CaperError(
+            f"{path}: no camera matrix; expected fx, fy, cx, cy, or intrinsic_matrix, K or "
+            "camera_matrix"
+        )
+    _check_matrix(path, key, matrix)
+    stated = camera.width, camera.height
+    if image_shape is not None and None not in stated and stated != image_shape[::-1]:
         height, width = image_shape
-        if (content["width"], content["height"]) != (width, height):
-            raise CaperError(
-                f"{path}: made for {content['width']} x {content['height']} images, this one is "
-                f"{width} x {height}; scale fx, fy, cx, cy, or give the right file"
-            )
+        raise CaperError(
+            f"{path}: made for {stated[0]} x {stated[1]} images, this one is {width} x {height}; "
+            "scale fx, fy, cx, cy, or give the right file"
+        )
     return matrix
 
 
-def _check_matrix(path: str | Path, key: str, matrix: np.ndarray, by_column: bool) -> None:
+def _matrix(path: str | Path, key: str, value: list[Any]) -> np.ndarray:
+    """[3, 3] from 9 numbers or 3 rows."""
+    if [np.size(row) for row in value] not in ([1] * 9, [3] * 3):
+        raise CaperError(f"{path}: {key} must be 9 numbers or 3 rows of 3, got {value!r:.60}")
+    return np.array(value, np.float64).reshape(3, 3)
+
+
+def _check_matrix(path: str | Path, key: str, matrix: np.ndarray) -> None:
     if not np.array_equal(matrix[2], [0, 0, 1]):
         if np.array_equal(matrix[:, 2], [0, 0, 1]):
-            order = "column by column" if by_column else "row by row"
+            order = "column by column" if key == "intrinsic_matrix" else "row by row"
             raise CaperError(f"{path}: {key} is transposed; it must be given {order}")
         raise CaperError(f"{path}: last row of {key} must be 0 0 1, got {matrix[2].tolist()}")
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
@@ -268,19 +359,3 @@ def _check_matrix(path: str | Path, key: str, matrix: np.ndarray, by_column: boo
         )
     if matrix[1, 0] != 0 or abs(matrix[0, 1]) > 1e-6 * matrix[0, 0]:
         raise CaperError(f"{path}: {key} has skew; rectify the images first")
-
-
-def _numbers(path: str | Path, key: str, value: Any) -> np.ndarray:
-    try:
-        numbers = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
-        raise CaperError(f"{path}: {key} must be 9 numbers, got {value!r}") from error
-    if numbers.shape not in ((9,), (3, 3)) or not np.isfinite(numbers).all():
-        raise CaperError(f"{path}: {key} must be 9 finite numbers, got shape {numbers.shape}")
-    return numbers
-
-
-def _number(path: str | Path, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise CaperError(f"{path}: {key} must be a number, got {value!r}")
-    return float(value)

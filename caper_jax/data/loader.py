@@ -4,32 +4,14 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
 
-import flax.struct
 import jax
 import numpy as np
 
-from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.clouds import MIN_POINTS, systematic_indices
-from caper_jax.data.types import Dataset, Frame, pose_problems
+from caper_jax.data.types import Batch, Dataset, Frame, pose_problems
 from caper_jax.errors import CaperError
 from caper_jax.geometry.raster_order import raster_order
-
-
-@flax.struct.dataclass
-class LabeledClouds:
-    """A batch from a dataset, with the fields of generated ones that training looks at.
-
-    Attributes:
-      points: [B, N, 3] float32 meters, camera frame.
-      labels: [B, N] int32 part of each point, -1 unknown.
-      pose: ArticulatedPose with leading axis B, float32.
-    """
-
-    points: Any
-    labels: Any
-    pose: ArticulatedPose
 
 
 class Loader:
@@ -60,13 +42,13 @@ class Loader:
         """Sets the threads up; nothing is read yet.
 
         Args:
-          dataset: labeled frames; read from several threads.
+          dataset: labeled frames; several threads read from it.
           batch_size: B, rows of the global batch.
           num_points: N.
           seed: of the order and of the choice of points.
           process: (index, count) of this process; by default JAX's.
           workers: threads that read ahead.
-          prefetch: batches to keep ready beyond the one asked for; 0 reads when asked.
+          prefetch: batches to keep ready beyond the requested one; 0 reads on request.
           cache_gib: frames that were read stay in memory up to so many GiB.
 
         Raises:
@@ -84,11 +66,11 @@ class Loader:
         self._seed = seed
         self._prefetch = prefetch
         self._orders: dict[int, np.ndarray] = {}
-        self._cache: dict[int, LabeledClouds | None] = {}
+        self._cache: dict[int, Batch | None] = {}
         self._free_bytes = int(cache_gib * 2**30)
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="loader")
-        self._ahead: dict[int, Future[LabeledClouds]] = {}
+        self._ahead: dict[int, Future[Batch]] = {}
 
     def __enter__(self) -> Loader:
         return self
@@ -97,17 +79,17 @@ class Loader:
         self.close()
 
     def close(self) -> None:
-        """Ends the threads; batches that were not asked for are dropped."""
+        """Ends the threads; batches that nobody requested are dropped."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
-    def __call__(self, step: int) -> LabeledClouds:
+    def __call__(self, step: int) -> Batch:
         """This process's rows of the batch of a step, [B / processes, ...].
 
         Raises:
           CaperError: a frame is broken or has no ground truth; names it.
         """
         wanted = self._ahead.pop(step, None) or self._pool.submit(self._batch, step)
-        # A jump, as after a resume, leaves batches behind that nobody will ask for.
+        # A jump, as after a resume, leaves batches behind that nobody will request.
         self._ahead = {s: batch for s, batch in self._ahead.items() if s > step}
         for later in range(step + 1, step + 1 + self._prefetch):
             if later not in self._ahead:
@@ -129,11 +111,11 @@ class Loader:
                 self._orders[epoch] = rng.permutation(len(self.dataset))
             return int(self._orders[epoch][rank]), epoch, rank
 
-    def _batch(self, step: int) -> LabeledClouds:
+    def _batch(self, step: int) -> Batch:
         rows = [self._row(step * self.batch_size + row) for row in self._rows]
         return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
-    def _row(self, position: int) -> LabeledClouds:
+    def _row(self, position: int) -> Batch:
         count = len(self.dataset)
         for skipped in range(count):
             index, epoch, rank = self._place(position + skipped)
@@ -147,9 +129,9 @@ class Loader:
             )
         rng = np.random.default_rng([self._seed, epoch, rank])
         picked = systematic_indices(len(frame.points), self._num_points, int(rng.integers(2**31)))
-        return LabeledClouds(frame.points[picked], frame.labels[picked], frame.pose)
+        return Batch(frame.points[picked], frame.labels[picked], frame.pose)
 
-    def _frame(self, index: int) -> LabeledClouds | None:
+    def _frame(self, index: int) -> Batch | None:
         """All points of a frame, or None if it shows too little; read once where memory allows."""
         try:
             return self._cache[index]
@@ -164,7 +146,7 @@ class Loader:
         return frame
 
 
-def _ready(frame: Frame, dataset: Dataset) -> LabeledClouds | None:
+def _ready(frame: Frame, dataset: Dataset) -> Batch | None:
     """What training needs of a frame, checked, in scan order; None if it shows too little."""
     where = f"frame {frame.name!r} of {dataset.category.name}"
     if frame.truth is None:
@@ -180,7 +162,7 @@ def _ready(frame: Frame, dataset: Dataset) -> LabeledClouds | None:
     labels = np.full(len(frame.points), -1) if frame.labels is None else frame.labels
     points, labels = frame.points[usable].astype(np.float32), labels[usable].astype(np.int32)
     order = raster_order(points)
-    return LabeledClouds(
+    return Batch(
         points=points[order],
         labels=labels[order],
         pose=jax.tree.map(lambda array: np.asarray(array, np.float32), frame.truth),

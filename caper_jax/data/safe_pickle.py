@@ -1,28 +1,27 @@
 """Pickles of numpy arrays and plain containers, read without running what they name.
 
 A pickle is a program: it may import and call anything, and even numpy's own ``__setstate__`` takes
-memory layouts on trust. So nothing that a file names is imported here. Arrays, scalars and dtypes
-are rebuilt from their bytes by this module; beside them only dictionaries, lists, tuples, sets,
-text, bytes and numbers are read. An .npz whose array holds objects is a pickle in a zip file, and
-is read in the same way.
+memory layouts on trust. So a file gets nothing but what ``_Unpickler.find_class`` lists, and arrays
+whose dtype, shape and bytes were checked here. An .npz whose array holds objects is a pickle in a
+zip file, and is read in the same way.
 """
 
 from __future__ import annotations
 
 import io
+import math
 import pickle
 import zipfile
-from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from caper_jax.errors import CaperError
 
-_NUMBERS = "biufc"
-_TEXTS = "SU"
+_KINDS = "biufcSUO"
+_MOST_BYTES = 1 << 30
 _MOST_VALUES = 10_000_000
 
 
@@ -36,17 +35,18 @@ def load(path: str | Path) -> Any:
       Its content: numpy arrays and scalars in plain containers.
 
     Raises:
-      CaperError: missing or broken file, or one that holds anything else (named).
+      CaperError: missing, broken or huge file, or one that holds anything else (named).
     """
     path = Path(path)
     if not path.is_file():
         raise CaperError(f"{path}: no such file")
-    with path.open("rb") as file:
-        return _read(file, _Unpickler, str(path))
+    if path.stat().st_size > _MOST_BYTES:
+        raise CaperError(f"{path}: larger than a pickle of arrays may be, {_MOST_BYTES:,} bytes")
+    return _read(path.read_bytes(), str(path))
 
 
 def load_npz(path: str | Path, key: str) -> Any:
-    """Reads one array of an .npz; an array of objects through the restricted unpickler.
+    """Reads one array of an .npz; an array of objects as ``load`` reads pickles.
 
     Args:
       path: the file.
@@ -56,8 +56,8 @@ def load_npz(path: str | Path, key: str) -> Any:
       The array; for an array of objects without axes (a dictionary that was saved), the object.
 
     Raises:
-      CaperError: missing or broken file, no such array, or objects that are no numpy arrays or
-        plain containers (named).
+      CaperError: missing, broken or huge file, no such array, or objects that are no numpy arrays
+        or plain containers (named).
     """
     path = Path(path)
     if not path.is_file():
@@ -68,28 +68,33 @@ def load_npz(path: str | Path, key: str) -> Any:
             names = [name.removesuffix(".npy") for name in archive.namelist()]
             if key not in names:
                 raise CaperError(f"{path}: lacks {key!r}, it holds {', '.join(names) or 'nothing'}")
+            if archive.getinfo(f"{key}.npy").file_size > _MOST_BYTES:
+                raise CaperError(f"{where}: larger than {_MOST_BYTES:,} bytes")
             content = io.BytesIO(archive.read(f"{key}.npy"))
         version = np.lib.format.read_magic(content)
-        if version == (1, 0):
-            header = np.lib.format.read_array_header_1_0(content)
-        else:
-            header = np.lib.format.read_array_header_2_0(content)
-        if not header[2].hasobject:
+        read_header = (
+            np.lib.format.read_array_header_1_0
+            if version == (1, 0)
+            else np.lib.format.read_array_header_2_0
+        )
+        shape, _, dtype = read_header(content)
+        if not dtype.hasobject:
             content.seek(0)
             return np.lib.format.read_array(content, allow_pickle=False)
     except CaperError:
         raise
     except Exception as error:  # zip, zlib and numpy each have their own
         raise CaperError(f"{where}: broken or no .npz file ({error})") from error
-    array = _read(content, _ObjectsUnpickler, where)
-    if not isinstance(array, np.ndarray) or array.shape != header[0]:
-        raise CaperError(f"{where}: the pickle holds no array of shape {header[0]}")
+    array = _read(content.read(), where)
+    if not isinstance(array, np.ndarray) or array.shape != shape:
+        raise CaperError(f"{where}: the pickle holds no array of shape {shape}")
     return array[()]
 
 
-def _read(file: IO[bytes], unpickler: type[_Unpickler], where: str) -> Any:
+def _read(content: bytes, where: str) -> Any:
     try:
-        return _plain(unpickler(file, encoding="latin1").load(), {})[0]
+        value = _Unpickler(io.BytesIO(content), encoding="latin1").load()
+        _count(value, {})
     except _ForbiddenError as error:
         raise CaperError(
             f"{where}: the pickle asks for {error}, but only numpy arrays and plain containers "
@@ -97,6 +102,7 @@ def _read(file: IO[bytes], unpickler: type[_Unpickler], where: str) -> Any:
         ) from error
     except Exception as error:  # a broken pickle fails in any way that Python can
         raise CaperError(f"{where}: broken pickle ({type(error).__name__}: {error})") from error
+    return value
 
 
 class _ForbiddenError(Exception):
@@ -105,98 +111,74 @@ class _ForbiddenError(Exception):
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str, /) -> Any:
-        place = module.replace("numpy.core.", "numpy._core.")
-        if (place, name) not in _KNOWN:
+        place = module.replace("numpy.core.", "numpy._core.").replace("__builtin__", "builtins")
+        known = _ALLOWED.get((place, name))
+        if known is None:
             raise _ForbiddenError(f"{module}.{name}")
-        return self._replacement(place, name)
-
-    def _replacement(self, module: str, name: str) -> Any:
-        return _KNOWN[module, name]
+        # A pickle may set attributes of a function, its defaults among them: it gets its own.
+        return known if isinstance(known, (type, str)) else _fresh(known)
 
     def persistent_load(self, pid: Any) -> Any:
         raise _ForbiddenError(f"an object outside the file ({pid!r})")
 
 
-class _ObjectsUnpickler(_Unpickler):
-    """Also reads arrays of objects, which themselves must be what is read."""
-
-    def _replacement(self, module: str, name: str) -> Any:
-        return _ObjectArray if name == "ndarray" else super()._replacement(module, name)
+def _fresh(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *arguments: function(*arguments)
 
 
 class _Dtype:
-    """Stands for numpy.dtype while the pickle runs: a kind, a width and a byte order."""
+    """Stands for numpy.dtype while the pickle runs, of whose state only the byte order is taken."""
 
-    def __init__(self, code: str, align: bool = False, copy: bool = True):
-        self.code, self.order = code, "|"
+    __slots__ = ("_code", "_order")
+
+    def __init__(self, code: str, *_: Any):
+        self._code, self._order = str(code), ""
 
     def __setstate__(self, state: tuple) -> None:
-        _, self.order, base, names = state[:4]
-        if base is not None or names is not None:
+        if state[2] is not None or state[3] is not None:
             raise _ForbiddenError("a numpy dtype with fields or sub-arrays")
+        self._order = {"<": "<", ">": ">"}.get(state[1], "")
 
     def real(self) -> np.dtype:
-        dtype = np.dtype(self.order.replace("=", "").replace("|", "") + self.code)
-        if dtype.kind not in _NUMBERS + _TEXTS:
+        dtype = np.dtype(self._order + self._code)
+        if dtype.kind not in _KINDS:
             raise _ForbiddenError(f"numpy values of dtype {dtype}")
         return dtype
 
 
-class _Array:
-    """Stands for an array while the pickle runs; the shape and data come as its state."""
+class _Array(np.ndarray):
+    """An array that gets its content as state, once it was checked."""
 
-    def __init__(self) -> None:
-        self.value = np.zeros(0)
-
-    def __setstate__(self, state: tuple) -> None:
+    def __setstate__(self, state: Any) -> None:
         _, shape, dtype, by_column, data = state
-        self.value = _from_bytes(data, dtype, shape, "F" if by_column else "C")
+        real, data = _checked(dtype, data, shape)
+        super().__setstate__((1, tuple(shape), real, bool(by_column), data))  # type: ignore[arg-type]
 
 
-class _ObjectArray(_Array):
-    """An array whose data may be a list of objects."""
-
-    def __setstate__(self, state: tuple) -> None:
-        _, shape, dtype, by_column, data = state
-        if not (isinstance(dtype, _Dtype) and dtype.code in ("O", "O8") and isinstance(data, list)):
-            super().__setstate__(state)
-            return
-        flat = np.empty(len(data), object)
-        for index, item in enumerate(data):
-            flat[index] = item
-        self.value = flat.reshape(shape, order="F" if by_column else "C")
-
-
-def _from_bytes(
-    data: Any, dtype: Any, shape: Any, order: str, axis_order: Any = None
-) -> np.ndarray:
-    """An array from its bytes.
-
-    Args:
-      data: the bytes.
-      dtype: a ``_Dtype``.
-      shape: of the bytes.
-      order: "C", "F", or "K" for bytes in C order whose axes then change places.
-      axis_order: which axis of the bytes becomes which of the array; with "K" alone.
-    """
-    if not isinstance(dtype, _Dtype):
-        raise _ForbiddenError(f"an array of dtype {dtype!r}")
+def _checked(dtype: Any, data: Any, shape: Any) -> tuple[np.dtype, Any]:
+    """The dtype and the bytes (of objects, the list) of an array, which fit its shape."""
+    if not isinstance(dtype, _Dtype) or not all(type(n) is int and n >= 0 for n in shape):
+        raise _ForbiddenError(f"an array of dtype {dtype!r} and shape {shape!r}")
+    real, count = dtype.real(), math.prod(shape)
     if isinstance(data, str):  # bytes of Python 2
         data = data.encode("latin1")
-    if not isinstance(data, (bytes, bytearray)):
-        raise _ForbiddenError("an array of Python objects")
-    flat = np.frombuffer(data, dtype.real())
-    if order == "K" and axis_order is not None:
-        return flat.reshape(shape).transpose(axis_order).copy()
-    return flat.reshape(shape, order=order).copy()  # type: ignore[call-overload]
+    of_objects = real.kind == "O"
+    size = count if of_objects else count * real.itemsize
+    fits = isinstance(data, list if of_objects else (bytes, bytearray)) and len(data) == size
+    if not fits or (count and not real.itemsize):
+        raise _ForbiddenError(f"an array of dtype {real} whose data do not fit its shape {shape}")
+    return real, data if of_objects else bytes(data)
 
 
-def _reconstruct(kind: Any, shape: Any, code: Any) -> _Array:
-    return _ObjectArray() if kind is _ObjectArray else _Array()
+def _from_bytes(data: Any, dtype: Any, shape: Any, order: str, axis_order: Any = None) -> Any:
+    """An array as protocol 5 writes it; "K" is C order of axes that then change places."""
+    real, data = _checked(dtype, data, shape)
+    array = np.frombuffer(data, real).reshape(shape, order="F" if order == "F" else "C").copy("K")
+    return array if axis_order is None else array.transpose(axis_order)
 
 
 def _scalar(dtype: Any, data: Any = b"") -> Any:
-    return _from_bytes(data, dtype, (), "C")[()]
+    return np.frombuffer(_checked(dtype, data, (1,))[1], dtype.real())[0]
 
 
 def _encode(text: str, encoding: str = "latin1") -> bytes:
@@ -206,89 +188,40 @@ def _encode(text: str, encoding: str = "latin1") -> bytes:
     return text.encode("latin1")
 
 
-def _empty() -> bytes:
-    return b""
-
-
-class _Function:
-    """Calls a function of this module, and lets a pickle set nothing in it.
-
-    Functions have attributes, ``__defaults__`` among them, that a pickle could change for all files
-    that are read later.
-    """
-
-    __slots__ = ("_function",)
-    _function: Callable[..., Any]
-
-    def __init__(self, function: Callable[..., Any]):
-        object.__setattr__(self, "_function", function)
-
-    def __call__(self, *arguments: Any) -> Any:
-        return self._function(*arguments)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        raise _ForbiddenError(f"a change of {self._function.__name__}")
-
-    def __setstate__(self, state: Any) -> None:
-        raise _ForbiddenError(f"a change of {self._function.__name__}")
-
-
-_KNOWN: dict[tuple[str, str], Any] = {
+_ALLOWED: dict[tuple[str, str], Any] = {
     ("numpy", "dtype"): _Dtype,
-    ("numpy", "ndarray"): _Array,
-    ("numpy._core.multiarray", "_reconstruct"): _Function(_reconstruct),
-    ("numpy._core.multiarray", "scalar"): _Function(_scalar),
-    ("numpy._core.numeric", "_frombuffer"): _Function(_from_bytes),
-    ("_codecs", "encode"): _Function(_encode),
-    ("collections", "OrderedDict"): OrderedDict,
-    **{
-        (module, name): kind
-        for module in ("builtins", "__builtin__")
-        for name, kind in (
-            ("set", set),
-            ("frozenset", frozenset),
-            ("complex", complex),
-            ("bytes", _Function(_empty)),
-        )
-    },
+    ("numpy", "ndarray"): "numpy.ndarray",  # named in what calls _reconstruct
+    ("numpy._core.multiarray", "_reconstruct"): lambda *_: _Array(0),
+    ("numpy._core.multiarray", "scalar"): _scalar,
+    ("numpy._core.numeric", "_frombuffer"): _from_bytes,
+    ("_codecs", "encode"): _encode,
+    ("collections", "OrderedDict"): dict,  # of which no method can be replaced
+    ("builtins", "set"): set,
+    ("builtins", "frozenset"): frozenset,
+    ("builtins", "complex"): complex,
+    ("builtins", "bytes"): lambda: b"",
 }
 
 
-# What was rebuilt, by the identity of the value: the value itself (kept, or another could get its
-# identity), what came of it, and how many values that holds.
-_Done = dict[int, tuple[Any, Any, int]]
+def _count(value: Any, counts: dict[int, float]) -> float:
+    """How many values a container holds; whoever goes through too many comes to no end.
 
-
-def _plain(value: Any, done: _Done) -> tuple[Any, int]:
-    """The value with its arrays in place of what stood for them, and how many values it holds.
-
-    A value that a pickle names often is rebuilt once: 20 lists that each hold the last one twice
-    are 134 bytes and a million values.
+    A pickle may name one value often: 20 lists that each hold the last one twice are 134 bytes and
+    a million values. ``counts`` has the values that were counted, by identity.
     """
-    if not isinstance(value, (_Array, dict, list, tuple, set, frozenset)):
-        if isinstance(value, (_Dtype, type)) or callable(value):
-            raise _ForbiddenError(f"a bare {getattr(value, '__name__', type(value).__name__)}")
-        return value, 1
-    if id(value) not in done:
-        done[id(value)] = value, *_rebuilt(value, done)
-    _, plain, count = done[id(value)]
-    if count > _MOST_VALUES:  # whoever goes through them would not come to an end
-        raise _ForbiddenError(f"more than {_MOST_VALUES:,} values")
-    return plain, count
-
-
-def _rebuilt(value: Any, done: _Done) -> tuple[Any, int]:
-    """A container or an array, see ``_plain``."""
-    if isinstance(value, _Array):
-        count = 1
-        if value.value.dtype == object:
-            for index in np.ndindex(value.value.shape):
-                value.value[index], more = _plain(value.value[index], done)
-                count += more
-        return value.value, count
+    if isinstance(value, (_Dtype, type)) or callable(value):
+        raise _ForbiddenError(f"a bare {getattr(value, '__name__', type(value).__name__)}")
     if isinstance(value, dict):
-        pairs = [(_plain(key, done), _plain(item, done)) for key, item in value.items()]
-        count = 1 + sum(key[1] + item[1] for key, item in pairs)
-        return {key[0]: item[0] for key, item in pairs}, count
-    items = [_plain(item, done) for item in value]
-    return type(value)(item for item, _ in items), 1 + sum(count for _, count in items)
+        inside = [*value.keys(), *value.values()]
+    elif isinstance(value, (list, tuple, set, frozenset)):
+        inside = list(value)
+    elif isinstance(value, np.ndarray) and value.dtype == object:
+        inside = value.ravel().tolist()
+    else:
+        return 1
+    if id(value) not in counts:
+        counts[id(value)] = math.inf  # of one that holds itself
+        counts[id(value)] = 1 + sum(_count(item, counts) for item in inside)
+    if counts[id(value)] > _MOST_VALUES:
+        raise _ForbiddenError(f"more than {_MOST_VALUES:,} values")
+    return counts[id(value)]

@@ -1,19 +1,20 @@
-"""One frame of data, what a dataset offers, and the checks that both must pass."""
+"""One frame of data, a batch of them, what a dataset offers, and the checks of their arrays."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
+import flax.struct
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int32
 
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.errors import CaperError
-from caper_jax.lie import se3
 
 if TYPE_CHECKING:
     from caper_jax.articulation.category import Category
@@ -24,6 +25,9 @@ _KINEMATICS_TOLERANCE_RAD = 5e-3
 _KINEMATICS_TOLERANCE_M = 1e-3
 _ROTATION_TOLERANCE = 1e-3
 _MAX_DISTANCE_M = 50.0
+
+# numpy or JAX arrays: the same container serves files, the generator and the networks.
+Array = Any
 
 
 class NoFramesError(CaperError):
@@ -36,33 +40,56 @@ class Frame:
 
     Attributes:
       name: unique within its dataset.
-      points: [N, 3] float32 meters, visible surface of the object.
-      labels: [N] int32 part of every point, -1 where unknown; None when the data has none.
+      points: [N, 3] meters, visible surface of the object; N is 0 where too little is visible.
+      labels: [N] part of every point, -1 where unknown; None when the data has none.
       truth: pose with arrays [K, ...]; None when the data has none.
       visible: [K] points or pixels that show each part; None when unknown.
       visibility: [K] fraction of each part that neither other parts nor other objects hide, of
         what the camera would see of it alone; None when unknown.
-      depth: [H, W] float32 meters, for pictures; None when the data has no image.
-      mask: [H, W] bool, the object in ``depth``.
-      intrinsics: [3, 3] of ``depth``.
-      instance: which object is shown, by its name in the data set (urdf_id, PartNet id, number of
+      depth: [H, W] meters, for pictures; None when the data has no image.
+      mask: [H, W], the object in ``depth``.
+      intrinsics: [3, 3] pixels, of ``depth``.
+      instance: which object is shown, by its name in the dataset (urdf_id, PartNet id, number of
         a generated shape); None when unknown.
     """
 
     name: str
-    points: np.ndarray
-    labels: np.ndarray | None = None
+    points: Float32[np.ndarray, "N 3"]
+    labels: Int32[np.ndarray, " N"] | None = None
     truth: ArticulatedPose | None = None
-    visible: np.ndarray | None = None
-    visibility: np.ndarray | None = None
-    depth: np.ndarray | None = None
-    mask: np.ndarray | None = None
-    intrinsics: np.ndarray | None = None
+    visible: Int[np.ndarray, " K"] | None = None
+    visibility: Float[np.ndarray, " K"] | None = None
+    depth: Float32[np.ndarray, "H W"] | None = None
+    mask: Bool[np.ndarray, "H W"] | None = None
+    intrinsics: Float64[np.ndarray, "3 3"] | None = None
     instance: str | None = None
 
 
+@flax.struct.dataclass
+class Batch:
+    """Labeled frames, generated or read from a dataset; leading axes are batch axes.
+
+    Attributes:
+      points: [B, N, 3] meters, camera frame, in scan order.
+      labels: [B, N] int32 part of each point, -1 unknown or residue.
+      pose: ArticulatedPose with leading axis B.
+      visible: [B, K] int32 pixels of each part in the mask, before sampling; None in training
+        data of a dataset.
+      instance: [B] int32 index of the object; None where unknown.
+      visibility: [B, K] ``visible`` over the pixels that the part would have if nothing, neither
+        another part nor something else, were in front of it; None unless measured.
+    """
+
+    points: Float[Array, "*batch N 3"]
+    labels: Int[Array, "*batch N"]
+    pose: ArticulatedPose
+    visible: Int[Array, "*batch K"] | None = None
+    instance: Int[Array, "*batch"] | None = None
+    visibility: Float[Array, "*batch K"] | None = None
+
+
 class Dataset(Protocol):
-    """A category's frames, read on demand.
+    """A category's frames, read on demand; several threads may read at once.
 
     Attributes:
       category: the category all frames show.
@@ -81,6 +108,63 @@ class Dataset(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int, /) -> Frame: ...
+
+    def videos(self) -> dict[str, list[int]]:
+        """Name of every video -> indices of its frames in the order of time; {} without videos."""
+        ...
+
+
+def array_problem(
+    name: str,
+    value: Any,
+    shape: tuple[int | None, ...],
+    dtype: type = np.floating,
+    low: float = -np.inf,
+    high: float = np.inf,
+) -> str | None:
+    """What is wrong with an array from outside, as a phrase that begins with its name, or None.
+
+    Args:
+      name: of the array or field.
+      value: anything that numpy takes for an array.
+      shape: what its shape must be; None stands for any length but 0.
+      dtype: its dtype, or an abstract one such as ``np.integer``.
+      low, high: range of its entries, ends included; none may be NaN or infinite in any case.
+    """
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different length
+        return f"{name} must be an array of shape {_shape_text(shape)}"
+    if array.ndim != len(shape) or any(
+        length != known if known is not None else length == 0
+        for known, length in zip(shape, array.shape, strict=True)
+    ):
+        return f"{name} has shape {array.shape}, expected {_shape_text(shape)}"
+    if not np.issubdtype(array.dtype, dtype):
+        return f"{name} is {array.dtype}, expected {dtype.__name__}"
+    if array.dtype.kind in "fc" and not np.isfinite(array).all():
+        return f"{name} has NaN or infinite entries{_first(~np.isfinite(array))}"
+    outside = (array < low) | (array > high)
+    if outside.any():
+        worst = array[tuple(np.argwhere(outside)[0])]
+        limits = f"at least {low:g}" if high == np.inf else f"from {low:g} to {high:g}"
+        return f"{name} must be {limits}, got {worst}{_first(outside)}"
+    return None
+
+
+def checked_array(
+    where: str,
+    value: Any,
+    shape: tuple[int | None, ...],
+    dtype: type = np.number,
+    low: float = -np.inf,
+    high: float = np.inf,
+) -> np.ndarray:
+    """An array from outside; CaperError, which begins with ``where``, for a wrong one."""
+    problem = array_problem(where, value, shape, dtype, low, high)
+    if problem:
+        raise CaperError(problem)
+    return np.asarray(value)
 
 
 def pose_shapes(num_parts: int) -> dict[str, tuple[int, ...]]:
@@ -132,16 +216,12 @@ def pose_problems(pose: ArticulatedPose, category: Category) -> list[str]:
       One phrase per problem, naming the first bad entry; empty when all is well.
     """
     arrays = {key: np.asarray(getattr(pose, key)) for key in pose_shapes(category.num_parts)}
-    problems = []
     lead = arrays["rotation"].shape[: max(arrays["rotation"].ndim - 3, 0)]
-    for key, shape in pose_shapes(category.num_parts).items():
-        array = arrays[key]
-        if array.shape != lead + shape:
-            problems.append(f"{key} has shape {array.shape}, expected {lead + shape}")
-        elif not np.issubdtype(array.dtype, np.floating):
-            problems.append(f"{key} is {array.dtype}, expected a float array")
-        elif not np.isfinite(array).all():
-            problems.append(f"{key} has NaN or infinite entries{_first(~np.isfinite(array))}")
+    checks = [
+        array_problem(key, arrays[key], lead + shape)
+        for key, shape in pose_shapes(category.num_parts).items()
+    ]
+    problems = [problem for problem in checks if problem is not None]
     if problems:
         return problems
     double = {key: array.astype(np.float64) for key, array in arrays.items()}
@@ -159,20 +239,28 @@ def pose_problems(pose: ArticulatedPose, category: Category) -> list[str]:
     if (double["size"] <= 0).any():
         problems.append(f"size must be positive{_first(double['size'] <= 0)}")
     for key in ("translation", "size", "box_center", "joint_pivot"):
-        if (np.abs(double[key]) > _MAX_DISTANCE_M).any():
-            problems.append(f"{key} is beyond {_MAX_DISTANCE_M:g} m: is it in millimeters?")
-    length = np.linalg.norm(double["joint_axis"], axis=-1)
-    if (np.abs(length - 1) > _ROTATION_TOLERANCE).any():
-        problems.append(f"joint_axis is not a unit vector{_first(np.abs(length - 1) > 1e-3)}")
+        problems += _far_problems(key, double[key])
+    slant = np.abs(np.linalg.norm(double["joint_axis"], axis=-1) - 1)
+    if (slant > _ROTATION_TOLERANCE).any():
+        problems.append(f"joint_axis is not a unit vector{_first(slant > _ROTATION_TOLERANCE)}")
     if not problems:
         problems += _kinematics_problems(double, category)
     return problems
 
 
+def _far_problems(key: str, lengths: np.ndarray) -> list[str]:
+    if np.abs(lengths).max(initial=0.0) > _MAX_DISTANCE_M:
+        return [f"{key} reach beyond {_MAX_DISTANCE_M:g} m: are they in millimeters?"]
+    return []
+
+
 def _kinematics_problems(arrays: dict[str, np.ndarray], category: Category) -> list[str]:
     """Parts whose pose differs from the one that the root, the joints and the states give."""
-    with jax.enable_x64(True):
-        expected = np.asarray(_part_poses(arrays, category.joint_types, category.parents))
+    root = np.zeros((*arrays["rotation"].shape[:-3], 4, 4))
+    root[..., :3, :3], root[..., 3, 3] = arrays["rotation"][..., 0, :, :], 1.0
+    root[..., :3, 3] = arrays["translation"][..., 0, :]
+    axis, pivot, state = (arrays[f"joint_{field}"] for field in ("axis", "pivot", "state"))
+    expected = part_poses(root, axis, pivot, state, category)
     # The chord |R - R'| / sqrt 2 equals the angle between the rotations to first order.
     chord = np.linalg.norm(expected[..., :3, :3] - arrays["rotation"], axis=(-1, -2)) / np.sqrt(2)
     distance = np.linalg.norm(expected[..., :3, 3] - arrays["translation"], axis=-1)
@@ -187,55 +275,42 @@ def _kinematics_problems(arrays: dict[str, np.ndarray], category: Category) -> l
     ]
 
 
-@partial(jax.jit, static_argnums=(1, 2))
-def _part_poses(arrays, joint_types, parents):
-    """[..., K, 4, 4] by forward kinematics from part 0 of ``arrays``."""
-    root = se3.from_rt(arrays["rotation"][..., 0, :, :], arrays["translation"][..., 0, :])
-    return forward_kinematics(
-        root,
-        arrays["joint_axis"],
-        arrays["joint_pivot"],
-        arrays["joint_state"],
-        joint_types,
-        parents,
-    )
+def part_poses(
+    root: Float64[np.ndarray, "*batch 4 4"],
+    axis: Float64[np.ndarray, "*batch J 3"],
+    pivot: Float64[np.ndarray, "*batch J 3"],
+    state: Float64[np.ndarray, "*batch J"],
+    category: Category,
+) -> Float64[np.ndarray, "*batch K 4 4"]:
+    """``forward_kinematics`` of a category in float64, for files."""
+    with jax.enable_x64(True):
+        joints = category.joint_types, category.parents
+        return np.asarray(_forward_kinematics(root, axis, pivot, state, *joints))
+
+
+_forward_kinematics = partial(jax.jit, static_argnums=(4, 5))(forward_kinematics)
 
 
 def _cloud_problems(frame: Frame, num_parts: int) -> list[str]:
-    problems = []
-    points = np.asarray(frame.points)
-    if points.ndim != 2 or points.shape[-1] != 3 or len(points) == 0:
-        problems.append(f"points has shape {points.shape}, expected (N, 3)")
-    elif points.dtype != np.float32:
-        problems.append(f"points is {points.dtype}, expected float32")
-    elif not np.isfinite(points).all():
-        problems.append(f"points has NaN or infinite entries{_first(~np.isfinite(points))}")
-    elif np.abs(points).max() > _MAX_DISTANCE_M:
-        problems.append(f"points reach beyond {_MAX_DISTANCE_M:g} m: are they in millimeters?")
-    if frame.labels is not None:
-        labels = np.asarray(frame.labels)
-        if labels.shape != points.shape[:1]:
-            problems.append(f"labels has shape {labels.shape}, expected {points.shape[:1]}")
-        elif labels.dtype != np.int32:
-            problems.append(f"labels is {labels.dtype}, expected int32")
-        elif ((labels < -1) | (labels >= num_parts)).any():
-            problems.append(
-                f"labels go from {labels.min()} to {labels.max()}, expected -1 (unknown) to "
-                f"{num_parts - 1}"
-            )
-    if frame.visible is not None:
-        visible = np.asarray(frame.visible)
-        if visible.shape != (num_parts,):
-            problems.append(f"visible has shape {visible.shape}, expected ({num_parts},)")
-        elif not np.issubdtype(visible.dtype, np.integer) or (visible < 0).any():
-            problems.append("visible must be counts, integers from 0 up")
-    if frame.visibility is not None:
-        visibility = np.asarray(frame.visibility)
-        if visibility.shape != (num_parts,):
-            problems.append(f"visibility has shape {visibility.shape}, expected ({num_parts},)")
-        elif not ((visibility >= 0) & (visibility <= 1)).all():
-            problems.append("visibility must be fractions from 0 to 1")
+    points = array_problem("points", frame.points, (None, 3), np.float32)
+    problems = [points] if points else _far_problems("points", frame.points)
+    length = np.shape(frame.points)[:1]
+    expected: dict[str, tuple[Any, ...]] = {  # shape, dtype and range of what may be left out
+        "labels": (length, np.int32, -1, num_parts - 1),
+        "visible": ((num_parts,), np.integer, 0),
+        "visibility": ((num_parts,), np.floating, 0, 1),
+    }
+    for name, arguments in expected.items():
+        value = getattr(frame, name)
+        problem = None if value is None else array_problem(name, value, *arguments)
+        problems += [problem] if problem else []
     return problems
+
+
+def _shape_text(shape: tuple[int | None, ...]) -> str:
+    """(N, 3) for (None, 3)."""
+    axes = ["N" if length is None else str(length) for length in shape]
+    return f"({', '.join(axes)}{',' if len(axes) == 1 else ''})"
 
 
 def _first(bad: np.ndarray) -> str:

@@ -39,7 +39,7 @@ class Problem:
 
 @dataclass
 class CategoryReport:
-    """What was found of one category.
+    """What was seen of one category.
 
     Attributes:
       category: its name.
@@ -70,7 +70,7 @@ def check_category(
     """Reads and checks every frame of a category; what is broken becomes a problem, not an error.
 
     Args:
-      format: one of ``data.FORMATS``.
+      format: one of ``data.readers.formats(labeled=True)``.
       root: the file or the root folder.
       category: one that the root holds.
       split: check this split only; None for all frames.

@@ -64,6 +64,8 @@ class LayoutWriter:
           CaperError: the root has another camera or frames of this split already.
         """
         self.category, self.split = category, split
+        conversion = category.datasets.get("artimage")
+        self._category_id = getattr(conversion, "category_id", 0)
         self.root, self.home = Path(root), Path(root) / category.name
         self._list = self.home / f"{split}.txt"
         if self._list.is_file() and self._list.read_text().strip():
@@ -158,7 +160,7 @@ class LayoutWriter:
         height, width = depth.shape
         instance = {
             "id": 1,
-            "category_id": self.category.artimage_id,
+            "category_id": self._category_id,
             "urdf_id": urdf_id,
             "bbox": [int(value) for value in box],
             "links": self._links(image),

@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.config import GeneratorConfig
+from caper_jax.data.types import Batch
 from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.geometry.raster_order import grid_raster_order
 from caper_jax.progress import progress
@@ -28,28 +28,6 @@ from caper_jax.synthetic.ray_casting import FAR, nearest_part, part_depths, proj
 
 FRAMES_AT_A_TIME = 25  # what the frames of a seed are depends on it
 _MARGIN = 0.04  # of the object's projected box, on each side
-
-
-@flax.struct.dataclass
-class Batch:
-    """Labeled frames.
-
-    Attributes:
-      points: [B, N, 3] meters, camera frame, in scan order.
-      labels: [B, N] int32 part of each point, -1 for residue.
-      pose: ArticulatedPose with leading axis B.
-      visible: [B, K] int32 pixels of each part in the mask, before sampling.
-      instance: [B] int32 index into the bank.
-      visibility: [B, K] ``visible`` over the pixels that the part would have if nothing, neither
-        another part nor something else, were in front of it; None unless measured.
-    """
-
-    points: Float[Any, "*B N 3"]
-    labels: Int[Any, "*B N"]
-    pose: ArticulatedPose
-    visible: Int[Any, "*B K"]
-    instance: Any
-    visibility: Float[Any, "*B K"] | None = None
 
 
 def systematic_sample(key: PRNGKeyArray, hit: Bool[Array, "G G"], count: int) -> Int[Array, " N"]:
@@ -351,5 +329,8 @@ def collect_frames(
     key = split_key(generator.split, seed)
     batch = collect(generator.batch, key, frames, FRAMES_AT_A_TIME, title)
     prefix = f"{generator.category.name}_{generator.split}"
-    names = [f"{prefix}{instance:04d}_{index:06d}" for index, instance in enumerate(batch.instance)]
+    names = [
+        f"{prefix}{instance:04d}_{index:06d}"
+        for index, instance in enumerate(np.asarray(batch.instance))
+    ]
     return {**vars(batch), "names": names}

@@ -16,12 +16,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from caper_jax.articulation.category import Category
+from caper_jax.data.types import Batch
 from caper_jax.data.urdf import ImportedObject
 from caper_jax.errors import CaperError
 from caper_jax.geometry.meshes import NEEDS_MESH, Mesh
 from caper_jax.geometry.raster_order import grid_raster_order
 from caper_jax.synthetic import sensor as sensors
-from caper_jax.synthetic.frames import Batch, FrameKeys, articulated_pose, draw_state_and_poses
+from caper_jax.synthetic.frames import FrameKeys, articulated_pose, draw_state_and_poses
 from caper_jax.synthetic.instances import InstanceBank, split_key
 
 

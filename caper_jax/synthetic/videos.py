@@ -17,11 +17,12 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from caper_jax.articulation.category import Category
 from caper_jax.config import GeneratorConfig
+from caper_jax.data.types import Batch
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.synthetic import sensor as sensors
 from caper_jax.synthetic.camera import camera_arc, camera_pose, draw_camera
-from caper_jax.synthetic.frames import Batch, FrameKeys, collect, observe, part_poses
+from caper_jax.synthetic.frames import FrameKeys, collect, observe, part_poses
 from caper_jax.synthetic.instances import InstanceBank, build_bank, draw_instances, split_key
 
 FRAMES = 30

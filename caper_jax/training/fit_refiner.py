@@ -19,6 +19,7 @@ import optax
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.config import PRESETS, GeneratorConfig, NetworkConfig, RefinerConfig
+from caper_jax.data.types import Batch
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load
 from caper_jax.geometry.frames import rotate, view_rotation
@@ -32,7 +33,6 @@ from caper_jax.models.pipeline import (
 )
 from caper_jax.models.refiner import BoxRefiner, RefinerOutput
 from caper_jax.progress import progress
-from caper_jax.synthetic.frames import Batch
 from caper_jax.training.fit_uncertainty import mixed_frames, nearer_symmetry
 
 FRAMES = 40_000

@@ -15,12 +15,13 @@ from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.articulation.symmetry import apply_symmetry, is_ambiguous
 from caper_jax.config import GeneratorConfig
+from caper_jax.data.types import Batch
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, estimate
 from caper_jax.lie import so3
 from caper_jax.models.uncertainty import COVERAGE
 from caper_jax.progress import progress
-from caper_jax.synthetic.frames import Batch, Generator
+from caper_jax.synthetic.frames import Generator
 from caper_jax.synthetic.sensor import CAMERAS
 
 FRAMES = 4096

@@ -73,7 +73,7 @@ class Objective:
         Args:
           params: {"root", "parts"}.
           model_state: mutable collections by name, each {"root", "parts"}.
-          batch: data.synthetic.scene.Batch, meters, camera frame; points in any order.
+          batch: ``data.types.Batch``, meters, camera frame; points in any order.
           key: PRNG key.
           progress: fraction of the run done (unused).
 

@@ -27,8 +27,9 @@ from caper_jax.config import (
     preset,
     to_dict,
 )
-from caper_jax.data.loader import LabeledClouds, Loader
+from caper_jax.data.loader import Loader
 from caper_jax.data.readers import open_dataset
+from caper_jax.data.types import Batch
 from caper_jax.errors import CaperError
 from caper_jax.estimator import load, network_of
 from caper_jax.models.files import (
@@ -41,7 +42,7 @@ from caper_jax.models.files import (
     write_card,
     write_model,
 )
-from caper_jax.synthetic.frames import Batch, Generator
+from caper_jax.synthetic.frames import Generator
 from caper_jax.training import fit_refiner, parallel
 from caper_jax.training.fit_uncertainty import calibrate
 from caper_jax.training.loop import FitResult, fit
@@ -152,7 +153,7 @@ def _finish(config: RunConfig, directory: str | Path) -> None:
 
 def _fit_generated(
     fit_task: Callable[..., FitResult], config: RunConfig, category: Category
-) -> tuple[FitResult, Callable[[], Batch | LabeledClouds]]:
+) -> tuple[FitResult, Callable[[], Batch]]:
     """Trains on endless generated frames; also a function that draws some of them."""
     generator = Generator(category, config.data, split="train", seed=config.training.seed)
     batch_size = config.training.batch_size
@@ -166,7 +167,7 @@ def _fit_generated(
 
 def _fit_dataset(
     fit_task: Callable[..., FitResult], config: RunConfig, source: LoaderConfig
-) -> tuple[FitResult, Callable[[], Batch | LabeledClouds]]:
+) -> tuple[FitResult, Callable[[], Batch]]:
     """Trains on a dataset; also a function that reads some of its frames."""
     dataset = open_dataset(
         source.format,
@@ -186,7 +187,7 @@ def _fit_dataset(
     ) as loader:
         result = fit_task(batches=loader)
 
-    def draw_sample() -> LabeledClouds:
+    def draw_sample() -> Batch:
         size = min(_SAMPLE, len(dataset))
         with Loader(dataset, size, *arguments, process=(0, 1), prefetch=0) as once:
             return once(0)
@@ -232,7 +233,7 @@ def averaged(start: Any, trained: Any, share: float) -> Any:
     return unflatten(mixed)
 
 
-def mean_pose(batch: Batch | LabeledClouds) -> dict[str, Any]:
+def mean_pose(batch: Batch) -> dict[str, Any]:
     """The trivial predictor: means of the training distribution, JSON-ready.
 
     Returns:
@@ -255,7 +256,7 @@ def mean_pose(batch: Batch | LabeledClouds) -> dict[str, Any]:
     }
 
 
-def _card(config: RunConfig, result: FitResult, sample: Batch | LabeledClouds) -> dict[str, Any]:
+def _card(config: RunConfig, result: FitResult, sample: Batch) -> dict[str, Any]:
     """The card of both stages: what was trained on what, where, and for how long."""
     state = result.state
     stages = replace(config, network=replace(config.network, refiner=RefinerConfig()))

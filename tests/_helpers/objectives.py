@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from caper_jax import categories
 from caper_jax.articulation.category import Category, Joint
 from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.data.types import Batch
 from caper_jax.geometry.raster_order import raster_order
-from caper_jax.synthetic.frames import Batch
 
 BOX = categories.get("box")
 

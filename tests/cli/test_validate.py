@@ -80,10 +80,10 @@ def test_everything_wrong_with_images_is_listed_at_once(tmp_path, capsys):
     found = messages(report)
     expected = [
         r"test.txt: names '000099.json', which has no annotation",
-        "000000.json: broken JSON at line 1",
+        "000000.json: broken JSON",
         "depth/000001.png: no such file",
-        "000002.json: transformation has determinant -1",
-        "000003.json: transformation must be 4x4 finite numbers",
+        "000002.json, link 0: transformation: must be a scaled rotation, has determinant -1",
+        "000003.json, link 1: transformation: must be 4 x 4 finite numbers",
         "000004: labels: put only",
         "000004: labels: put only",
     ]
@@ -135,7 +135,7 @@ def test_broken_annotations_of_reartmix_hide_nothing(tmp_path):
 def test_what_no_reader_expects_is_a_problem_too(tmp_path, monkeypatch):
     """One frame, or one split, must not cost the report of the others."""
     root = roots.artimage(tmp_path / "root")
-    get, open_one = ArtImageDataset.__getitem__, ArtImageDataset._read_list
+    get, open_one = ArtImageDataset.__getitem__, ArtImageDataset.list_frames
 
     def item(self, index):
         if self.names[index] == "000001":
@@ -148,7 +148,7 @@ def test_what_no_reader_expects_is_a_problem_too(tmp_path, monkeypatch):
         return open_one(self)
 
     monkeypatch.setattr(ArtImageDataset, "__getitem__", item)
-    monkeypatch.setattr(ArtImageDataset, "_read_list", listed)
+    monkeypatch.setattr(ArtImageDataset, "list_frames", listed)
     code, (report,) = report_of(tmp_path, "artimage", root)
     assert code == 1 and report["frames"] == 6 and report["bad_frames"] == 1
     assert report["splits"] == {"test": 3, "train": None}
@@ -181,7 +181,7 @@ def test_damaged_files(tmp_path, capsys):
     code, (report,) = report_of(tmp_path, "caper", path)
     assert code == 1 and report["frames"] == 0
     (message,) = set(messages(report))
-    assert "labels must be -1 (unknown) to 1" in message
+    assert "labels must be from -1 to 1" in message
     assert "joint_state has NaN or infinite entries at [2, 0]" in message
 
 

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
 from caper_jax.articulation.category import Category, Joint
-from caper_jax.data.readers.artimage_models import read_model
+from caper_jax.articulation.conversions import ArtImageConversion
+from caper_jax.data.readers import artimage_models
 from caper_jax.errors import CaperError
 
 
@@ -59,7 +60,13 @@ def category_of(name, types, parents):
         unit=1.0,
         mean_size=((1.0,) * 3,) * parts,
         mean_center=((0.0,) * 3,) * parts,
+        datasets=categories.get(name).datasets if name in categories.names() else {},
     )
+
+
+def read_model(folder, urdf_id, category):
+    conversion = category.datasets.get("artimage", ArtImageConversion())
+    return artimage_models.read_model(folder, str(urdf_id), category, conversion)
 
 
 def cuboid(center, size):

@@ -2,12 +2,15 @@
 
 import json
 
+import numpy as np
 import pytest
 from _helpers import roots
 from _helpers.formats import FORMATS, write_root
 
-from caper_jax.data.readers import OFFICIAL_SPLITS, categories_in, open_dataset, splits_in
-from caper_jax.data.types import NoFramesError, validate
+from caper_jax.data import readers
+from caper_jax.data.readers import categories_in, formats, open_dataset, reader_of, splits_in
+from caper_jax.data.readers.base import DatasetReader, list_splits, natural_order, read_list
+from caper_jax.data.types import Frame, NoFramesError, validate
 from caper_jax.errors import CaperError
 
 OBJECTS = {
@@ -61,7 +64,7 @@ def test_points_per_frame_are_those_asked_for(root, format):
 
 def test_official_splits(root, format):
     arguments = (format, root, FORMATS[format][0], SPLITS[format][-1])
-    if format not in OFFICIAL_SPLITS:
+    if not reader_of(format).has_official_split:
         with pytest.raises(CaperError, match=f"format '{format}' has no official split"):
             open_dataset(*arguments, official_split=True)
     elif SPLITS[format][-1] == "train":
@@ -105,3 +108,92 @@ def test_roots_that_are_none(root, format, tmp_path):
             categories_in(format, place)
     with pytest.raises(CaperError, match=f"unknown format '{format}s'"):
         categories_in(f"{format}s", root)
+
+
+class Clouds(DatasetReader):
+    """A reader of one's own: <category>/<video>/<frame>.npy."""
+
+    format = "clouds"
+    mask_source = "none needed"
+    labeled = False
+    has_videos = True
+
+    @classmethod
+    def categories_in(cls, root):
+        return [path.name for path in root.iterdir() if path.is_dir()]
+
+    @classmethod
+    def split_folder(cls, root, category):
+        return root / category.name
+
+    def list_frames(self):
+        files = (self.root / self.category.name).glob("*/*.npy")
+        return {f"{path.parent.name}/{path.stem}": path for path in sorted(files)}
+
+    def read_frame(self, name, path):
+        return Frame(name, np.load(path, allow_pickle=False))
+
+
+def test_a_reader_of_ones_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(readers, "_READERS", dict(readers._READERS))
+    readers.register("clouds", Clouds)
+    readers.register("clouds", Clouds)
+    with pytest.raises(CaperError, match="'clouds' is already registered"):
+        readers.register("clouds", reader_of("folder"))
+    assert "clouds" in formats() and "clouds" in formats(videos=True)
+    assert "clouds" not in formats(labeled=True)
+
+    for name in ("a/1", "a/2", "b/1"):
+        path = tmp_path / f"box/{name}.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, np.full((20, 3), len(name), np.float32))
+    (tmp_path / "box/train.txt").write_text("b/1\na/1\n")
+    assert categories_in("clouds", tmp_path) == ["box"]
+    assert splits_in("clouds", tmp_path, "box") == ["train"]
+    dataset = open_dataset("clouds", tmp_path, "box")
+    assert dataset.videos() == {"a": [0, 1], "b": [2]} and dataset.split == "all"
+    validate(dataset[2], dataset.category)
+    assert list(open_dataset("clouds", tmp_path, "box", "train").names) == ["b/1", "a/1"]
+    with pytest.raises(CaperError, match=r"no split 'test' \(no test\.txt\); it has all, train"):
+        open_dataset("clouds", tmp_path, "box", "test")
+    with pytest.raises(NoFramesError):
+        open_dataset("clouds", tmp_path, "laptop")
+
+
+def test_natural_order():
+    names = ["10", "9", "a10", "a9", "09", "a9b", "a"]
+    assert sorted(names, key=natural_order) == [
+        "09", "9", "10", "a", "a9", "a9b", "a10",
+    ]  # fmt: skip
+
+
+def test_only_lists_of_frames_are_splits(tmp_path):
+    texts = {
+        "train": "000001.json\n000002.json\n",
+        "test": "scene6/000003_0",
+        "val": "kitchen.json last.json",
+        "none": "",
+        "README": "\nReArtMix data\n000001.json\n",
+        "notes": "100 frames of boxes",
+    }
+    for name, text in texts.items():
+        (tmp_path / f"{name}.txt").write_text(text)
+    (tmp_path / "folder.txt").mkdir()
+    assert list_splits(tmp_path) == ["none", "test", "train", "val"]
+
+
+def test_a_mark_of_utf_8_belongs_to_no_name(tmp_path):
+    (tmp_path / "a.txt").write_text("000001\n", encoding="utf-8-sig")
+    assert read_list(tmp_path / "a.txt") == ["000001"]
+
+
+@pytest.mark.parametrize("format", ["artimage", "pm-videos", "reart-videos", "reartmix"])
+def test_lists_in_another_encoding_and_other_texts(tmp_path, format):
+    root, category = write_root(format, tmp_path), FORMATS[format][0]
+    path = next(tmp_path.glob("**/train.txt"))
+    path.with_name("README.txt").write_text("Boxes and more\n")
+    path.write_text(path.read_text(), encoding="utf-16")
+    splits = splits_in(format, root, category)
+    assert "train" in splits and "README" not in splits
+    with pytest.raises(CaperError, match=r"train\.txt: not a text file in UTF-8"):
+        open_dataset(format, root, category, "train")

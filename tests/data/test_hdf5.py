@@ -95,15 +95,18 @@ def test_unwritable_places_are_named_first(tmp_path):
     [
         ({"points": np.zeros((FRAMES, POINTS, 2))}, r"points must be \[F, N, 3\]"),
         ({"points": np.full((FRAMES, POINTS, 3), np.nan)}, "points_mean has NaN"),
-        ({"labels": np.full((FRAMES, POINTS), 2)}, r"labels must be -1 \(unknown\) to 1"),
-        ({"labels": np.zeros((FRAMES, POINTS - 1))}, "labels is int8"),
-        ({"visible": np.full((FRAMES, 2), -1)}, "visible must not be negative"),
-        ({"visibility": np.full((FRAMES, 2), 1.1)}, "visibility must be fractions"),
-        ({"visibility": np.ones((FRAMES, 3))}, r"visibility is float32 \(5, 3\)"),
+        (
+            {"labels": np.full((FRAMES, POINTS), 2)},
+            "labels must be from -1 to 1, got 2",
+        ),
+        ({"labels": np.zeros((FRAMES, POINTS - 1))}, r"labels has shape \(5, 299\)"),
+        ({"visible": np.full((FRAMES, 2), -1)}, "visible must be at least 0"),
+        ({"visibility": np.full((FRAMES, 2), 1.1)}, "visibility must be from 0 to 1"),
+        ({"visibility": np.ones((FRAMES, 3))}, r"visibility has shape \(5, 3\)"),
         ({"visibility": np.full((FRAMES, 2), np.nan)}, "visibility has NaN"),
         ({"video": np.zeros(FRAMES)}, "video and frame must be given together"),
         ({"video": [0] * FRAMES, "frame": [0, 1, 2, 3, 3]}, "name a frame twice"),
-        ({"video": [0] * FRAMES, "frame": [-1, 1, 2, 3, 4]}, "must not be negative"),
+        ({"video": [0] * FRAMES, "frame": [-1, 1, 2, 3, 4]}, "frame must be at least 0"),
         ({"names": ["a"] * FRAMES}, "name has duplicates"),
         ({"names": ["a"]}, "name is"),
     ],
@@ -122,7 +125,7 @@ def test_what_a_file_must_say_about_itself(tmp_path):
     with pytest.raises(CaperError, match="holds split 'test', not 'train'"):
         Hdf5Dataset(path, "box", "train")
     for key, value, message in (
-        ("format_version", 99, "version 99, this program reads"),
+        ("format_version", 99, "format_version: .* 99"),
         ("category", "bxo", "unknown category 'bxo'; did you mean 'box'"),
     ):
         write_box(path, overwrite=True)
@@ -132,7 +135,7 @@ def test_what_a_file_must_say_about_itself(tmp_path):
             Hdf5Dataset(path)
     with h5py.File(path, "r+") as file:
         del file.attrs["units"]
-    with pytest.raises(CaperError, match="lacks the attribute 'units'"):
+    with pytest.raises(CaperError, match="lacks 'units'"):
         Hdf5Dataset(path)
 
 
@@ -222,8 +225,8 @@ def test_validate_names_every_problem_at_once():
     for phrase in (
         "frame 'f' of box",
         "points is float64",
-        "labels go from 5 to 5",
-        "visible must be counts",
+        "labels must be from -1 to 1, got 5 at [0]",
+        "visible must be at least 0, got -1 at [1]",
         "size must be positive at [0, 0]",
         "joint_axis is not a unit vector",
     ):
@@ -240,7 +243,7 @@ def test_validate_names_every_problem_at_once():
         (lambda t: t.replace(translation=1000 * t.translation), "millimeters"),
         (lambda t: t.replace(joint_pivot=t.joint_pivot + 0.02), "axis and pivot are in the root"),
         (lambda t: t.replace(size=t.size[:1]), r"size has shape \(1, 3\), expected \(2, 3\)"),
-        (lambda t: t.replace(size=t.size.astype(int)), "expected a float array"),
+        (lambda t: t.replace(size=t.size.astype(int)), "size is int64, expected floating"),
         (lambda t: t.replace(joint_pivot=t.joint_pivot * np.nan), r"joint_pivot has NaN.*\[0, 0\]"),
     ],
 )
@@ -260,7 +263,7 @@ def test_validate_understands_poses(change, message):
         ({"labels": np.zeros(POINTS)}, "labels is float64, expected int32"),
         ({"visible": np.zeros(3, int)}, r"visible has shape \(3,\)"),
         ({"visibility": np.ones(3)}, r"visibility has shape \(3,\)"),
-        ({"visibility": np.array([0.5, np.nan])}, "visibility must be fractions"),
+        ({"visibility": np.array([0.5, np.nan])}, r"visibility has NaN.* at \[1\]"),
     ],
 )
 def test_validate_understands_clouds(changes, message):

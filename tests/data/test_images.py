@@ -183,14 +183,15 @@ def test_every_layout_of_intrinsics(tmp_path, content):
         ({"intrinsic_matrix": EXPECTED.ravel().tolist()}, "transposed.*column by column"),
         ({"K": EXPECTED.T.tolist()}, "transposed.*row by row"),
         ({"K": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]}, "last row of K must be 0 0 1"),
-        ({"K": [[1, 2], [3, 4]]}, "K must be 9 finite numbers"),
+        ({"K": [[1, 2], [3, 4]]}, "K must be 9 numbers"),
         ({"K": [[1, 0], [3, 4, 5], 2]}, "K must be 9 numbers"),
+        ({"K": [float("nan")] * 9}, r"K\.0: "),
         ({"K": (EXPECTED * [1, -1, 1]).tolist()}, "focal lengths must be positive"),
         ({"K": np.add(EXPECTED, [[0, 1, 0], [0, 0, 0], [0, 0, 0]]).tolist()}, "has skew"),
         ({"fx": 900, "cx": 3, "cy": 4}, "lacks fy"),
-        ({"fx": "900", "fy": 900, "cx": 3, "cy": 4}, "fx must be a number"),
+        ({"fx": "900", "fy": 900, "cx": 3, "cy": 4}, r"camera\.json: fx: .*'900'"),
         ({"focal": 900}, "no camera matrix"),
-        ([914.2, 913.0], "expected a JSON object"),
+        ([914.2, 913.0], r"camera\.json: "),
         (
             {"width": 640, "height": 480, "intrinsic_matrix": EXPECTED.T.ravel().tolist()},
             "made for 640 x 480 images, this one is 1280 x 720",
@@ -207,11 +208,14 @@ def test_wrong_intrinsics_are_named(tmp_path, content, message):
 def test_broken_json_is_named_with_its_place(tmp_path):
     path = tmp_path / "camera.json"
     path.write_text('{"fx": 1,\n "fy" 2}')
+    with pytest.raises(CaperError, match=r"camera\.json: broken JSON .*line 2,? column 7"):
+        read_intrinsics(path)
     with pytest.raises(CaperError, match=r"camera\.json: broken JSON at line 2, column 7"):
-        read_intrinsics(path)
+        read_json(path)
     path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(CaperError, match="not a JSON text"):
-        read_intrinsics(path)
+    for read in (read_intrinsics, read_json):
+        with pytest.raises(CaperError, match=r"camera\.json: "):
+            read(path)
     with pytest.raises(CaperError, match="no such file"):
         read_intrinsics(tmp_path / "absent.json")
 

@@ -12,7 +12,6 @@ import pytest
 from _helpers.frames import random_frames
 
 from caper_jax import categories
-from caper_jax.config import LoaderConfig
 from caper_jax.data.loader import Loader
 from caper_jax.data.types import Frame
 from caper_jax.errors import CaperError
@@ -161,5 +160,3 @@ def test_what_cannot_be_trained_on_is_named():
             loader(0)
     with pytest.raises(CaperError, match="batch_size 5 cannot be split over 2 processes"):
         Loader(Frames(), 5, process=(0, 2))
-    with pytest.raises(CaperError, match=r"loader\.workers must be at least 1"):
-        LoaderConfig("caper", "x.h5", workers=0)

@@ -9,8 +9,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from caper_jax.data.readers import open_dataset
-from caper_jax.data.readers.reartmix import ReArtMixDataset
-from caper_jax.data.readers.reartmix_models import conversion_of
+from caper_jax.data.readers.reart import ReArtMixDataset
 from caper_jax.data.types import pose_problems, validate
 from caper_jax.errors import CaperError
 
@@ -147,12 +146,18 @@ def set_transformation(value):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda a: a["instances"][0].update(urdf_id=77), "instance 0: urdf_id 77 is not in"),
-        (lambda a: a["instances"][0]["links"].pop(), "a link lacks 1"),
-        (lambda a: a["instances"][0]["links"][0].pop("segmentation"), "lacks 'segmentation'"),
+        (lambda a: a["instances"][0].update(urdf_id=77), "urdf_metas.json: .* id 77"),
+        (lambda a: a["instances"][0]["links"].pop(), "instance 0: link_category_id must be 1 to 2"),
+        (
+            lambda a: a["instances"][0]["links"][0].pop("segmentation"),
+            "link 0: .*'segmentation'",
+        ),
         (set_transformation(np.diag([1, 1, -1, 1]).tolist()), "determinant -1"),
-        (set_transformation(np.diag([1, 2, 1, 1]).tolist()), "no scaled rotation"),
-        (set_transformation([[1, 2]]), "must be 4x4"),
+        (
+            set_transformation(np.diag([1, 2, 1, 1]).tolist()),
+            "must be a scaled rotation, is off",
+        ),
+        (set_transformation([[1, 2]]), "link 0: transformation: must be 4 x 4"),
         (lambda a: a.update(depth_path="scene6/000009.png"), r"000009\.png: no such file"),
     ],
 )
@@ -164,7 +169,7 @@ def test_bad_annotations_are_named(root, tmp_path, edit, message):
 
 def test_annotations_of_another_kind_are_named(root, tmp_path):
     copy_frame(root, tmp_path, lambda a: a["instances"][0].pop("category_id"))
-    with pytest.raises(CaperError, match=r"000001\.json: an instance lacks 'category_id'"):
+    with pytest.raises(CaperError, match=r"000001\.json: instances.0 lacks 'category_id'"):
         ReArtMixDataset(tmp_path, "box")
 
 
@@ -173,7 +178,7 @@ def test_splits_and_categories_it_does_not_have(root, tmp_path):
         ReArtMixDataset(root, "box", "test")
     with pytest.raises(CaperError, match="unknown ReArtMix category 'laptop'"):
         ReArtMixDataset(root, "laptop")
-    with pytest.raises(CaperError, match=r"no ReArtMix folder \(it lacks annotations/\)"):
+    with pytest.raises(CaperError, match=r"no ReArtMix folder of 'box' \(it lacks annotations/\)"):
         ReArtMixDataset(tmp_path, "box")
     copy_frame(root, tmp_path)
     (tmp_path / "val.txt").write_text("scene6/000001_7\n")
@@ -375,11 +380,9 @@ def test_models_unlike_the_others_are_named(root, tmp_path, metas, edit, message
     content = {"urdf_metas": [metas[10] | edit]}
     (tmp_path / "urdf_metas.json").write_text(json.dumps(content))
     with pytest.raises(CaperError, match=f"model 10: .*{message}"):
-        open_dataset("reartmix", tmp_path, "stapler")
+        open_dataset("reartmix", tmp_path, "stapler")[0]
 
 
 def test_categories_that_do_not_fit():
     with pytest.raises(CaperError, match=r"drawers with one drawer each \(2 parts\).*box, cutter"):
-        conversion_of("drawer", "ReArtMix")
-    with pytest.raises(CaperError, match="unknown ReArtMix category 'scissor'; did you mean 'sc"):
-        conversion_of("scissor", "ReArtMix")
+        ReArtMixDataset(".", "drawer")

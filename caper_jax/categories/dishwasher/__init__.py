@@ -10,6 +10,7 @@ import itertools
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.conversions import ArtImageConversion, Front
 from caper_jax.articulation.mesh_object import MeshObject
 from caper_jax.articulation.urdf_rule import (
     UrdfRule,
@@ -184,5 +185,10 @@ DISHWASHER = Category(
         child_words=("door",),
         partnet_classes=("Dishwasher",),
     ),
-    artimage_id=3,
+    datasets={
+        # In the files the open door lies ahead of the body.
+        "artimage": ArtImageConversion(
+            3, (11700, 12530, 12559, 12580), Front("ahead", axes=((1, 0, 0),))
+        ),
+    },
 )

@@ -7,6 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.conversions import (
+    ArtImageConversion,
+    CaptraConversion,
+    Front,
+    NotConvertible,
+)
 from caper_jax.articulation.mesh_object import MeshObject
 from caper_jax.articulation.urdf_rule import (
     CanonicalAxes,
@@ -221,6 +227,7 @@ def _stack(ref: MeshObject, front: np.ndarray) -> np.ndarray | None:
     return up if variance[-1] > 4 * variance[-2] and height < 1.25 * width else None
 
 
+_FRONT = Front("slide", axes=((0, 0, 1),) * 3, sorted_by=1)
 DRAWER = Category(
     name="drawer",
     parts=("body", "drawer1", "drawer2", "drawer3"),
@@ -248,5 +255,11 @@ DRAWER = Category(
         order=1,
         partnet_classes=("StorageFurniture", "Table"),
     ),
-    artimage_id=4,
+    datasets={
+        "artimage": ArtImageConversion(4, (46123, 45841, 46440), _FRONT),
+        "captra": CaptraConversion("drawers", (46440, 46123), _FRONT),
+        "reart": NotConvertible(
+            "drawers with one drawer each (2 parts), but our category 'drawer' has three (4 parts)"
+        ),
+    },
 )

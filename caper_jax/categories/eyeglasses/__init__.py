@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
+from caper_jax.articulation.conversions import ArtImageConversion, CaptraConversion, Front
 from caper_jax.articulation.mesh_object import MeshObject
 from caper_jax.articulation.urdf_rule import (
     CanonicalAxes,
@@ -186,6 +187,8 @@ def _temple_axes(ref: MeshObject) -> np.ndarray:
     return np.sign(sides)[:, None] * _Y
 
 
+# In the files the temples reach back from the lenses.
+_FRONT = Front("behind", axes=((0, -1, 0), (0, 1, 0)), sorted_by=0)
 EYEGLASSES = Category(
     name="eyeglasses",
     closed="high",
@@ -208,5 +211,12 @@ EYEGLASSES = Category(
         snap=20.0,
         partnet_classes=("Eyeglasses",),
     ),
-    artimage_id=2,
+    datasets={
+        "artimage": ArtImageConversion(2, (101300, 101859, 102586, 102590, 102596, 102612), _FRONT),
+        "captra": CaptraConversion(
+            "glasses",
+            (101839, 101848, 101860, 101326, 101868, 102591, 102596, 103028),
+            _FRONT,
+        ),
+    },
 )

@@ -1,8 +1,13 @@
-"""Frames: their schema and checks, readers of datasets, and the synthetic generator."""
+"""Readers of labeled datasets, by the name that their layout has on the command line.
+
+A reader of your own is a subclass of ``DatasetReader`` in a file anywhere and one call of
+``register``; inside this package, it is one file here and one line in ``_READERS``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,13 +15,65 @@ from caper_jax import categories
 from caper_jax.errors import CaperError, unknown_name
 
 if TYPE_CHECKING:
-    from caper_jax.data.types import Dataset
+    from caper_jax.data.readers.base import DatasetReader
 
-__all__ = ["FORMATS", "categories_in", "open_dataset", "splits_in"]
+__all__ = ["categories_in", "formats", "open_dataset", "reader_of", "register", "splits_in"]
 
-# Layouts on disk, by the name they have on the command line.
-FORMATS = ("artimage", "caper", "captra", "pm-videos", "reart-videos", "reartmix")
-OFFICIAL_SPLITS = ("artimage", "captra", "pm-videos", "reart-videos")
+# Modules of this project's readers, each imported when it is first used.
+_READERS: dict[str, str | type[DatasetReader]] = {
+    "artimage": "caper_jax.data.readers.artimage:ArtImageDataset",
+    "caper": "caper_jax.data.hdf5:Hdf5Dataset",
+    "captra": "caper_jax.data.readers.captra:CaptraDataset",
+    "folder": "caper_jax.data.readers.depth_folder:DepthFolder",
+    "pm-videos": "caper_jax.data.readers.artimage:PmVideosDataset",
+    "reart-videos": "caper_jax.data.readers.reart:ReArtVideosDataset",
+    "reartmix": "caper_jax.data.readers.reart:ReArtMixDataset",
+}
+
+
+def register(name: str, reader: type[DatasetReader]) -> None:
+    """Makes a reader known under a name, for the rest of the process.
+
+    Args:
+      name: of the layout, as on the command line.
+      reader: a subclass of ``DatasetReader``.
+
+    Raises:
+      CaperError: another reader already has that name.
+    """
+    if _READERS.get(name, reader) is not reader:
+        raise CaperError(f"format {name!r} is already registered; choose another name")
+    _READERS[name] = reader
+
+
+def formats(*, labeled: bool = False, videos: bool = False) -> tuple[str, ...]:
+    """Names of the known layouts, sorted.
+
+    Args:
+      labeled: only those with ground truth, on which models are trained and measured.
+      videos: only those that may hold videos.
+    """
+    readers = {name: reader_of(name) for name in _READERS} if labeled or videos else {}
+    return tuple(
+        name
+        for name in sorted(_READERS)
+        if (not labeled or readers[name].labeled) and (not videos or readers[name].has_videos)
+    )
+
+
+def reader_of(format: str) -> type[DatasetReader]:
+    """The reader of a layout.
+
+    Raises:
+      CaperError: unknown format; names the nearest.
+    """
+    if format not in _READERS:
+        raise unknown_name("format", format, _READERS)
+    reader = _READERS[format]
+    if isinstance(reader, str):
+        module, _, name = reader.partition(":")
+        reader = getattr(import_module(module), name)
+    return reader
 
 
 def open_dataset(
@@ -27,94 +84,59 @@ def open_dataset(
     official_split: bool = False,
     num_points: int = 1024,
     on_broken: Callable[[CaperError], None] | None = None,
-) -> Dataset:
-    """Opens a labeled dataset; frames are read when asked for.
+    **options: Any,
+) -> DatasetReader:
+    """Opens a dataset; a frame is read when it is indexed.
 
     Args:
-      format: one of ``FORMATS``; "caper" is one HDF5 file of this project, the others are public
-        layouts.
+      format: one of ``formats()``; "caper" is one HDF5 file of this project, "folder" depth images
+        of one's own, the others are public layouts.
       root: the file or the root folder.
       category: the category to read; its name, or FILE.py:NAME (see ``categories.get``).
       split: the split to read; None for all there is.
-      official_split: tell train from test by the objects of the official split too (artimage,
-        captra, pm-videos and reart-videos).
+      official_split: tell train from test by the objects of the official split too, where the
+        dataset has one.
       num_points: points per frame of the layouts with images; a file of "caper" has its own.
       on_broken: called with the error of every file that the layout must read beforehand but can
-        leave out (annotations of reartmix); by default such an error is raised.
+        leave out; by default such an error is raised.
+      **options: of this format alone, see its reader (``depth_scale`` of "folder").
 
     Raises:
       CaperError: unknown format, one without an official split, or data that do not fit the
         format, category or split.
     """
-    reader = _reader(format)
-    if format == "caper":
-        options: dict[str, Any] = {}
-    elif format == "reartmix":
-        options = {"num_points": num_points, "on_broken": on_broken}
-    else:
-        options = {"num_points": num_points, "official_split": official_split}
-    if official_split and format not in OFFICIAL_SPLITS:
-        raise CaperError(f"format {format!r} has no official split ({', '.join(OFFICIAL_SPLITS)})")
-    dataset: Dataset = reader(root, categories.get(category).name, split, **options)
-    return dataset
+    name = categories.get(category).name
+    reader = reader_of(format)
+    return reader(root, name, split, num_points, official_split, on_broken, **options)
 
 
 def categories_in(format: str, root: str | Path) -> list[str]:
     """The registered categories that a root holds, sorted; no frame is read.
 
     Args:
-      format: one of ``FORMATS``.
+      format: one of ``formats(labeled=True)``.
       root: the file or the root folder.
 
     Raises:
       CaperError: unknown format, or a root that holds none of the categories in this layout.
     """
-    reader, root = _reader(format), Path(root)
+    reader, root = reader_of(format), Path(root)
     if format != "caper" and not root.is_dir():
         raise CaperError(f"{root}: no such folder (format {format!r} is a folder)")
-    found = sorted(set(reader.categories_in(root)) & set(categories.names()))
-    if not found:
+    held = sorted(set(reader.categories_in(root)) & set(categories.names()))
+    if not held:
         raise CaperError(
             f"{root}: holds no {format} data of a known category ({', '.join(categories.names())})"
         )
-    return found
+    return held
 
 
 def splits_in(format: str, root: str | Path, category: str) -> list[str]:
     """The splits that a root lists for one of its categories.
 
     Args:
-      format: one of ``FORMATS``.
+      format: one of ``formats()``.
       root: the file or the root folder.
       category: one of ``categories_in``.
     """
-    return list(_reader(format).splits_in(Path(root), category))
-
-
-def _reader(format: str) -> Any:
-    """The class of a layout, imported only when it is used."""
-    if format == "artimage":
-        from caper_jax.data.readers.artimage import ArtImageDataset
-
-        return ArtImageDataset
-    if format == "caper":
-        from caper_jax.data.hdf5 import Hdf5Dataset
-
-        return Hdf5Dataset
-    if format == "captra":
-        from caper_jax.data.readers.captra import CaptraDataset
-
-        return CaptraDataset
-    if format == "pm-videos":
-        from caper_jax.data.readers.pm_videos import PmVideosDataset
-
-        return PmVideosDataset
-    if format == "reart-videos":
-        from caper_jax.data.readers.reart_videos import ReArtVideosDataset
-
-        return ReArtVideosDataset
-    if format == "reartmix":
-        from caper_jax.data.readers.reartmix import ReArtMixDataset
-
-        return ReArtMixDataset
-    raise unknown_name("format", format, FORMATS)
+    return reader_of(format).splits_in(Path(root), categories.get(category))

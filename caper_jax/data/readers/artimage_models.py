@@ -14,184 +14,217 @@ A category's ``urdf`` folder holds rest_state.json and, per object, the joints
 
 Public loaders know only joints on the root. Here rest poses compose along the tree, and the
 origin of a joint on another part counts from that part's own joint, as in any URDF.
+
+The files keep objects in an upright frame (y up) at a rest pose of their own. The sample data for
+laptop, dishwasher and drawer have our frame and our rest pose. The official files could not be
+read. What is known of them is that PartNet objects stand upright and face one horizontal axis, so
+the front is told from the parts at rest, as the category's ``ArtImageConversion`` says. That the
+official rest pose is ours (laptop and dishwasher open by 90 deg, drawers closed, glasses unfolded)
+is assumed, not verified. Objects of a category without a conversion are taken to be in our frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.category import Category
-from caper_jax.data.images import read_json
-from caper_jax.data.readers.artimage_frames import AxisMap, Rest, canonical_axes
+from caper_jax.articulation.conversions import ArtImageConversion, AxisMap, Front, RestObject
+from caper_jax.data.images import check_values, read_json
+from caper_jax.data.readers.annotations import Model
+from caper_jax.data.readers.base import Schema
 from caper_jax.data.readers.public_urdf import (
     ALIGNED,
     POINT_ORDER,
     RAW,
     UrdfJoint,
-    base_joint,
     moving_joints,
     number_of,
+    parse_urdf,
+    read_joints,
 )
-from caper_jax.data.readers.reartmix_models import Model
+from caper_jax.data.types import part_poses
 from caper_jax.errors import CaperError
 
 REST_STATES = "rest_state.json"
 POINTS = "part_point_sample"
+_LEAST_SHARE = 0.3  # of a direction must be horizontal to tell where the front is
+_LEAST_COSINE = 0.5  # between a joint's axis and the one it must be
 
 
-@dataclass(frozen=True)
-class RestModel(Model):
-    """A model together with the file's numbering.
+class _RestState(Schema):
+    """State of a part at rest, degrees or meters."""
 
-    Attributes:
-      links: part k is link ``links[k]`` of the file.
-      signs: [J] our state of joint j is ``signs[j]`` times the file's.
-    """
-
-    links: tuple[int, ...]
-    signs: np.ndarray
+    state: float
 
 
-def read_model(folder: Path, urdf_id: int | str, category: Category) -> RestModel:
+def read_model(
+    folder: Path, object_id: str, category: Category, conversion: ArtImageConversion
+) -> Model:
     """Reads one object and brings it to our rest pose and frame.
 
     Args:
       folder: the category's ``urdf`` folder.
-      urdf_id: name of the object's folder in it.
+      object_id: name of the object's folder in it.
       category: gives the parts, their tree and the types of joints.
+      conversion: of the category.
 
     Raises:
       CaperError: missing or broken files, or an object that does not fit the category.
     """
-    home = folder / str(urdf_id)
+    home = folder / object_id
     if not home.is_dir():
-        raise CaperError(f"{folder}: no object {urdf_id} (no folder of that name)")
+        raise CaperError(f"{folder}: no object {object_id} (no folder of that name)")
     joints = _read_joints(home / ALIGNED, category)
-    states = _rest_states(folder / REST_STATES, urdf_id, joints)
+    states = _rest_states(folder / REST_STATES, object_id, joints)
     points = [_read_points(home / POINTS / f"{k}.xyz") for k in range(category.num_parts)]
 
-    # Poses of the parts at rest, and joints there: raw points -> the file's rest frame.
-    poses = [_base_change(home) if category.name == "scissors" else np.eye(4)]
+    # Raw points -> the file's rest frame. Axes and pivots of the raw points' frame.
+    senses = np.array([-1.0 if joint.kind == "revolute" else 1.0 for joint in joints])
+    axes = np.array([joint.axis for joint in joints])[:, POINT_ORDER]
     pivots = [np.zeros(3)]
-    axis, pivot, opening = [], [], []
-    for joint, state in zip(joints, states, strict=True):
-        number = _parent(joint)
-        parent, own_axis = poses[number], joint.axis[POINT_ORDER]
-        own_axis = own_axis / np.linalg.norm(own_axis)
-        pivots.append(joint.origin[POINT_ORDER] + (pivots[number] if number else 0.0))
-        sense = -1.0 if joint.kind == "revolute" else 1.0
-        poses.append(parent @ _motion(joint.kind, own_axis, pivots[-1], sense * state))
-        axis.append(sense * parent[:3, :3] @ own_axis)
-        pivot.append(parent[:3, :3] @ pivots[-1] + parent[:3, 3])
-        low, high = joint.limits or (state, state + 1.0)
-        opening.append(1.0 if high - state >= state - low else -1.0)
-    moved = [p @ pose[:3, :3].T + pose[:3, 3] for p, pose in zip(points, poses, strict=True)]
+    for joint, parent in zip(joints, category.parents, strict=True):
+        pivots.append(joint.xyz[POINT_ORDER] + pivots[parent])
+    root = _base_change(home) if conversion.moved_by_base else np.eye(4)
+    poses = part_poses(root, axes, np.array(pivots[1:]), senses * states, category)
 
-    rest = Rest(moved, np.array(axis), np.array(pivot), np.array(opening))
-    reading = canonical_axes(rest, category, str(home))
-    return rest_model(rest, poses, reading)
+    carriers = poses[list(category.parents)]
+    turned = np.einsum("jab,jb->ja", carriers[:, :3, :3], axes)
+    rest = RestObject(
+        points=[p @ pose[:3, :3].T + pose[:3, 3] for p, pose in zip(points, poses, strict=True)],
+        axis=senses[:, None] * turned,
+        pivot=np.einsum("jab,jb->ja", carriers[:, :3, :3], pivots[1:]) + carriers[:, :3, 3],
+        opening=np.array([_opening(j, state) for j, state in zip(joints, states, strict=True)]),
+    )
+    return rest_model(rest, poses, canonical_axes(rest, category, conversion.axes, str(home)))
 
 
-def rest_model(rest: Rest, poses: Sequence[np.ndarray], reading: AxisMap) -> RestModel:
-    """The model of an object whose reading is known.
+def canonical_axes(rest: RestObject, category: Category, rule, where: str) -> AxisMap:
+    """The rotation, order and signs that bring an object of a public file to our conventions.
+
+    Args:
+      rest: the object at the file's rest pose, in the file's frame.
+      category: ours.
+      rule: ``ArtImageConversion.axes``.
+      where: the file, for errors.
+
+    Raises:
+      CaperError: an object that does not face one side, or whose joints lie across those of its
+        category.
+    """
+    order = np.arange(category.num_parts)
+    if rule is None:
+        return AxisMap(np.eye(3), tuple(order.tolist()), np.ones(category.num_joints))
+    if not isinstance(rule, Front):
+        return rule(rest, where)
+    centers = np.array([(part.min(0) + part.max(0)) / 2 for part in rest.points])
+    if rule.shown_by == "slide":
+        front = (rest.opening[:, None] * rest.axis).mean(0)
+    else:
+        front = (centers[1:] - centers[0]).mean(0) * (1 if rule.shown_by == "ahead" else -1)
+    if np.hypot(front[0], front[2]) < _LEAST_SHARE * np.linalg.norm(front):
+        raise CaperError(
+            f"{where}: cannot tell the front of this {category.name}: its parts lie above each "
+            "other or slide upwards; y must be up"
+        )
+    # By quarters about y, after which the front is +z.
+    quarters = np.rint(np.arctan2(-front[0], front[2]) / (np.pi / 2))
+    rotation = np.rint(Rotation.from_euler("y", 90 * quarters, degrees=True).as_matrix())
+
+    if rule.sorted_by is not None:
+        order[1:] = 1 + np.argsort(centers[1:] @ rotation[rule.sorted_by], kind="stable")
+    axis = rest.axis[order[1:] - 1] @ rotation.T
+    cosines = (axis * np.array(rule.axes)).sum(-1)
+    if (np.abs(cosines) < _LEAST_COSINE).any():
+        joint = int(np.abs(cosines).argmin())
+        raise CaperError(
+            f"{where}: the axis of joint {order[joint + 1]} lies across that of a {category.name} "
+            f"({np.round(axis[joint], 3).tolist()} in our frame, expected {rule.axes[joint]})"
+        )
+    return AxisMap(rotation, tuple(order.tolist()), np.sign(cosines))
+
+
+def rest_model(rest: RestObject, poses: Sequence[np.ndarray] | np.ndarray, axes: AxisMap) -> Model:
+    """The model of an object whose axes are known.
 
     Args:
       rest: the object at rest, in the file's frame.
       poses: K [4, 4], the links' own frames -> that frame, at rest.
-      reading: how it becomes ours.
+      axes: how it becomes ours.
     """
-    turn, order = reading.turn, list(reading.order)
+    rotation, order = axes.rotation, list(axes.order)
     joints = np.array(order[1:], int) - 1
-    boxes = [rest.points[link] @ turn.T for link in order]
+    boxes = [rest.points[link] @ rotation.T for link in order]
     low, high = np.array([b.min(0) for b in boxes]), np.array([b.max(0) for b in boxes])
     origin = (low.min(0) + high.max(0)) / 2
     # p_raw = R_rest^T (A^T (p_ours + origin) - t_rest)
     back = [poses[link][:3, :3].T for link in order]
-    shift = [turn.T @ origin - poses[link][:3, 3] for link in order]
-    axis = rest.axis[joints] @ turn.T
-    return RestModel(
-        to_file_rotation=np.stack([b @ turn.T for b in back]),
+    shift = [rotation.T @ origin - poses[link][:3, 3] for link in order]
+    return Model(
+        to_file_rotation=np.stack([b @ rotation.T for b in back]),
         to_file_shift=np.stack([b @ s for b, s in zip(back, shift, strict=True)]),
         size=high - low,
         center=(low + high) / 2 - origin,
-        file_axis=rest.axis[joints],
-        axis=reading.signs[:, None] * axis,
-        pivot=rest.pivot[joints] @ turn.T - origin,
-        links=reading.order,
-        signs=reading.signs,
+        axis=axes.signs[:, None] * (rest.axis[joints] @ rotation.T),
+        pivot=rest.pivot[joints] @ rotation.T - origin,
+        links=axes.order,
+        signs=axes.signs,
     )
 
 
 def _read_joints(path: Path, category: Category) -> list[UrdfJoint]:
     """J joints in the order of their child links, checked against the category's tree."""
-    joints = moving_joints(path, number_of)
-    found = {joint.child: (_parent(joint), joint.kind) for joint in joints}
-    expected = {j + 1: (joint.parent, joint.type) for j, joint in enumerate(category.joints)}
-    if found != expected:
+    joints = moving_joints(path, r"(\d+)$")
+    # The base is the root's own frame.
+    tree = [(number_of(joint.parent) or 0, joint.kind) for joint in joints]
+    expected = [(joint.parent, joint.type) for joint in category.joints]
+    if tree != expected:
         raise CaperError(
-            f"{path}: joints (child: parent, type) are {found}, but {category.name} has {expected}"
+            f"{path}: joints (parent, type) are {tree}, but {category.name} has {expected}"
         )
     return joints
 
 
-def _parent(joint: UrdfJoint) -> int:
-    """Number of the link a joint is mounted on; the base is the root's own frame."""
-    return number_of(joint.parent) or 0
+def _opening(joint: UrdfJoint, state: float) -> float:
+    """+1 where more of the joint's range lies above its state at rest, else -1."""
+    low, high = joint.limits
+    return 1.0 if high - state >= state - low else -1.0
 
 
-def _rest_states(path: Path, urdf_id: int | str, joints: list[UrdfJoint]) -> list[float]:
+def _rest_states(path: Path, object_id: str, joints: list[UrdfJoint]) -> np.ndarray:
     """[J] radians or meters; an object that the file does not list is stored at rest."""
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise CaperError(f"{path}: expected an object of objects {{urdf_id: {{part: state}}}}")
-    entry = content.get(str(urdf_id))
+    content = check_values(dict[str, dict[str, Any]], read_json(path), str(path))
+    if object_id not in content and all(joint.kind == "revolute" for joint in joints):
+        return np.zeros(len(joints))
     states = []
-    for child, joint in enumerate(joints, start=1):
-        if entry is None and joint.kind == "revolute":
-            states.append(0.0)
-            continue
-        where = f"{path}: {urdf_id}, part {child}"
-        try:
-            state = float((entry or {})[str(child)]["state"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise CaperError(f"{where}: needs a number 'state'") from error
-        if not np.isfinite(state):
-            raise CaperError(f"{where}: state must be finite, got {state}")
-        states.append(float(np.radians(state)) if joint.kind == "revolute" else state)
-    return states
+    for child in map(str, range(1, len(joints) + 1)):
+        entry = content.get(object_id, {}).get(child, {})
+        states.append(check_values(_RestState, entry, f"{path}: {object_id}, part {child}").state)
+    revolute = [joint.kind == "revolute" for joint in joints]
+    return np.where(revolute, np.radians(states), states)
 
 
 def _base_change(home: Path) -> np.ndarray:
-    """[4, 4] extra transform of scissors: aligned minus raw base joint, as loaders compute it."""
-    (xyz, rpy), (raw_xyz, raw_rpy) = (base_joint(home / name) for name in (ALIGNED, RAW))
+    """[4, 4]: aligned minus raw base joint, as public loaders compute it."""
+    base, raw = (_base_joint(home / name) for name in (ALIGNED, RAW))
     change = np.eye(4)
     # (r, p, y) count as turns by -r, y and -p about z, x and y, one after the other (intrinsic).
-    z, x, y = (rpy - raw_rpy)[[0, 2, 1]] * (-1, 1, -1)
-    change[:3, :3] = _turn(np.eye(3)[2], z) @ _turn(np.eye(3)[0], x) @ _turn(np.eye(3)[1], y)
-    change[:3, 3] = (xyz - raw_xyz)[[0, 2, 1]] * (-1, 1, -1)
+    angles = (base.rpy - raw.rpy)[[0, 2, 1]] * (-1, 1, -1)
+    change[:3, :3] = Rotation.from_euler("ZXY", angles).as_matrix()
+    change[:3, 3] = (base.xyz - raw.xyz)[[0, 2, 1]] * (-1, 1, -1)
     return change
 
 
-def _motion(kind: str, axis: np.ndarray, pivot: np.ndarray, state: float) -> np.ndarray:
-    """[4, 4] turn about, or slide along, a unit axis."""
-    motion = np.eye(4)
-    if kind == "revolute":
-        motion[:3, :3] = _turn(axis, state)
-        motion[:3, 3] = pivot - motion[:3, :3] @ pivot
-    else:
-        motion[:3, 3] = state * axis
-    return motion
-
-
-def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    """[3, 3] rotation about a unit axis (Rodrigues)."""
-    x, y, z = axis
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
+def _base_joint(path: Path) -> UrdfJoint:
+    """The joint that is numbered 0."""
+    for joint in read_joints(parse_urdf(path), path):
+        if joint.name.split("_")[1:2] == ["0"]:
+            return joint
+    raise CaperError(f"{path}: lacks the base joint (name <text>_0)")
 
 
 def _read_points(path: Path) -> np.ndarray:

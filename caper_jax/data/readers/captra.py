@@ -2,243 +2,319 @@
 
 Layout of a root folder, read unchanged::
 
-    urdf/<category>/<instance>/mobility.urdf      the objects (captra_models.py)
+    urdf/<category>/<instance>/mobility.urdf      the objects
     render/<category>/<instance>/<track>/cloud/<frame>.npz, gt/<frame>.pkl      for training
     render_seq/<category>/<instance>/<track>/...  videos, for tests
 
-Categories are ``glasses``, ``scissors``, ``laptop`` and ``drawers`` there. An .npz holds one
-pickled dictionary ``all_dict``: camera_matrix [3, 3], depth (OpenGL's z-buffer, 0 to 1, 1 where
-there is nothing), seg (number of the link; higher ones are ground and robot), near and far. A
-.pkl holds ``camera_pose`` and, by number of the link, ``link_pose``: (position, quaternion wxyz)
-in the world, of a camera that looks along x with y to its left and z up. Pickles are read without
-running what they name (safe_pickle.py).
+An .npz holds one pickled dictionary ``all_dict``: camera_matrix [3, 3], depth (OpenGL's z-buffer, 0
+to 1, 1 where there is nothing), seg (number of the link; higher ones are ground and robot), near
+and far. A .pkl holds ``camera_pose`` and, by number of the link, ``link_pose``: (position,
+quaternion wxyz) in the world, of a camera that looks along x with y to its left and z up. Pickles
+are read without running what they name (safe_pickle.py).
 
 The layout is what the public loader opens; no data of it could be read. Not verified are: that
 frames of render/ are numbered apart from those of render_seq/ (they are told apart here), that
-every object stands upright in its URDF with y up, and its rest pose, which the files do not state
-and captra_models.py finds. Lengths are PartNet's, read as meters.
+every object stands upright in its URDF with y up, and its rest pose. Lengths are PartNet's, read as
+meters.
+
+An object is a URDF with links ``base``, ``link_0``, ``link_1``, ... whose meshes are placed in
+their link by the origin of their <visual>. One link hangs on the base by a fixed joint and is the
+root, the first or the last of them; the others hang on the root. The files know no rest pose:
+states count from the pose that the object was modeled in. The rest pose follows from the parts and
+the ranges of the joints as for any imported URDF (data/urdf/rules.py), canonical axes as for
+ArtImage's objects, or, for a category without a ``Front``, as for any imported URDF. Of a pair of
+scissors the root is the blade with the longer handle, and x halves the angle between the tips.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import lru_cache
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+from xml.etree import ElementTree
 
 import numpy as np
+from pydantic import PlainValidator
+from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
 from caper_jax.articulation.category import Category
+from caper_jax.articulation.conversions import AxisMap, CaptraConversion, RestObject
+from caper_jax.articulation.mesh_object import MeshObject
 from caper_jax.data import safe_pickle
-from caper_jax.data.readers.annotated import labeled_frame, pose_of_links
-from caper_jax.data.readers.artimage_models import RestModel
-from caper_jax.data.readers.captra_models import read_model
-from caper_jax.data.readers.listing import in_natural_order
-from caper_jax.data.types import Frame, NoFramesError
+from caper_jax.data.images import check_values
+from caper_jax.data.readers.annotations import (
+    Model,
+    ScaledPose,
+    finite_array,
+    labeled_frame,
+    pose_of_parts,
+)
+from caper_jax.data.readers.artimage_models import canonical_axes, rest_model
+from caper_jax.data.readers.base import ALL, DatasetReader, Schema, group_videos, in_natural_order
+from caper_jax.data.readers.public_urdf import (
+    UrdfJoint,
+    number_of,
+    parse_urdf,
+    pose_of,
+    pose_of_origin,
+    read_joints,
+    vector,
+)
+from caper_jax.data.types import Frame, checked_array
 from caper_jax.errors import CaperError, unknown_name
+from caper_jax.geometry.meshes import Mesh, join, read_mesh
 
-FORMAT = "captra"
-ALL = "all"
-# Objects of the official test split.
-TEST_OBJECTS = {
-    "eyeglasses": (101839, 101848, 101860, 101326, 101868, 102591, 102596, 103028),
-    "scissors": (10559, 10564, 11029),
-    "laptop": (10101, 10270, 10356, 11156, 11405, 11581),
-    "drawer": (46440, 46123),
-}
-_FOLDERS = {
-    "eyeglasses": "glasses",
-    "scissors": "scissors",
-    "laptop": "laptop",
-    "drawer": "drawers",
-}
 _PLACES = {"train": "render", "test": "render_seq"}
-_ARRAYS = {"camera_matrix": 2, "depth": 2, "seg": 2, "near": 0, "far": 0}
 # Axes of the files' camera (ahead, left, up) -> OpenCV's (right, down, ahead).
 _CAMERA_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
-class CaptraDataset:
-    """The frames of one category; names are ``<instance>/<track>/<frame>``, e.g. 10040/0/17.
-
-    A frame that shows too little for a cloud has no points: to an evaluation, a failure.
-    AxisMap frames from several threads at once is safe.
-
-    Attributes:
-      category, format, split, mask_source, names: see ``Dataset``; where both folders are read,
-        names begin with theirs: ``render_seq/10040/0/17``.
-    """
-
-    format = FORMAT
-    mask_source = "simulated segmentation"
-
-    def __init__(
-        self,
-        root: str | Path,
-        category: str,
-        split: str | None = None,
-        num_points: int = 1024,
-        official_split: bool = False,
-    ):
-        """Lists the frames; clouds, poses and objects are read when a frame is.
-
-        Args:
-          root: the folder that holds urdf/ and render/ or render_seq/.
-          category: our name of the category to read.
-          split: "train" for render/, "test" for render_seq/; None or "all" for both.
-          num_points: points per frame.
-          official_split: keep only frames of the objects that the official split puts in
-            ``split``.
-
-        Raises:
-          CaperError: not such a folder, or a split or category that it does not have.
-        """
-        self.root = Path(root)
-        self.category: Category = categories.get(category)
-        if self.category.name not in _FOLDERS:
-            raise unknown_name("CAPTRA category", self.category.name, _FOLDERS)
-        self.split = split or ALL
-        if self.split not in (ALL, *_PLACES):
-            raise unknown_name("split of CAPTRA", self.split, (ALL, *_PLACES))
-        self._num_points = num_points
-        self._folder = _FOLDERS[self.category.name]
-        self._urdfs = self.root / "urdf" / self._folder
-        if not self._urdfs.is_dir():
-            raise CaperError(
-                f"{self.root}: no CAPTRA folder of {self.category.name!r} (it lacks "
-                f"urdf/{self._folder}/)"
-            )
-        self._model = lru_cache(maxsize=None)(self._read_model)
-        self._files = self._list_frames()
-        if official_split:
-            self._keep_official()
-        if not self._files:
-            raise NoFramesError(f"{self.root}: split {self.split!r} holds no {self.category.name}")
-        self.names: Sequence[str] = list(self._files)
-
-    @staticmethod
-    def categories_in(root: Path) -> list[str]:
-        """Our names of the categories that a root holds."""
-        return [
-            name
-            for name, folder in _FOLDERS.items()
-            if (root / "urdf" / folder).is_dir()
-            and any((root / place / folder).is_dir() for place in _PLACES.values())
-        ]
-
-    @staticmethod
-    def splits_in(root: Path, category: str) -> list[str]:
-        """Splits that a root holds of a category."""
-        folder = _FOLDERS.get(category, category)
-        return [split for split, place in _PLACES.items() if (root / place / folder).is_dir()]
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __getitem__(self, index: int, /) -> Frame:
-        name = self.names[index]
-        cloud = self._files[name]
-        instance = cloud.parts[-4]
-        model = self._model(instance)
-        poses = self._read_poses(cloud.parent.parent / "gt" / f"{cloud.stem}.pkl")
-        links = [{"transformation": poses[link]} for link in model.links]
-        truth = pose_of_links(model, links, self.category, str(cloud), scaled=False)
-        depth, seg, intrinsics = _read_image(cloud)
-        part_of_link = np.full(self.category.num_parts + 1, -1)
-        part_of_link[list(model.links)] = np.arange(self.category.num_parts)
-        known = (seg >= 0) & (seg < self.category.num_parts) & (depth > 0)
-        parts = part_of_link[np.where(known, seg, -1)]
-        return labeled_frame(name, depth, parts, intrinsics, truth, self._num_points, instance)
-
-    def videos(self) -> dict[str, list[int]]:
-        """Name of every track of render_seq/ -> indices of its frames, in the order of time."""
-        videos: dict[str, list[int]] = {}
-        for index, (name, path) in enumerate(self._files.items()):
-            if path.parts[-6] == _PLACES["test"]:
-                videos.setdefault(name.rpartition("/")[0], []).append(index)
-        return videos
-
-    def _list_frames(self) -> dict[str, Path]:
-        """Name -> cloud, tracks and frames in the order of their numbers."""
-        files = {}
-        for place in _PLACES.values() if self.split == ALL else (_PLACES[self.split],):
-            for path in (self.root / place / self._folder).glob("*/*/cloud/*.npz"):
-                name = f"{path.parts[-4]}/{path.parts[-3]}/{path.stem}"
-                files[f"{place}/{name}" if self.split == ALL else name] = path
-        return in_natural_order(files)
-
-    def _keep_official(self) -> None:
-        """Keeps frames whose object the official split puts in this one."""
-        if self.split not in _PLACES:
-            raise CaperError(f"the official split has train and test, not {self.split!r}")
-        tests = {str(number) for number in TEST_OBJECTS[self.category.name]}
-        self._files = {
-            name: path
-            for name, path in self._files.items()
-            if (path.parts[-4] in tests) == (self.split == "test")
-        }
-
-    def _read_model(self, instance: str) -> RestModel:
-        return read_model(self._urdfs / instance, self.category)
-
-    def _read_poses(self, path: Path) -> list[np.ndarray]:
-        """[4, 4] of every link, link -> camera (OpenCV)."""
-        content = safe_pickle.load(path)
-        try:
-            camera = _matrix(content["camera_pose"], f"{path}: camera_pose")
-            links = [
-                _matrix(content["link_pose"][link], f"{path}: link_pose {link}")
-                for link in range(self.category.num_parts)
-            ]
-        except (KeyError, IndexError, TypeError) as error:
-            raise CaperError(f"{path}: lacks {error}") from error
-        world_to_camera = _CAMERA_AXES @ np.linalg.inv(camera)
-        return [world_to_camera @ link for link in links]
-
-
-def _matrix(pose: Any, where: str) -> np.ndarray:
-    """[4, 4] of (position [3], quaternion [4] wxyz)."""
-    try:
-        position, quaternion = (np.asarray(value, np.float64) for value in pose)
-    except (TypeError, ValueError) as error:
-        raise CaperError(f"{where} must be a position and a quaternion, got {pose!r}") from error
-    length = np.linalg.norm(quaternion)
-    if position.shape != (3,) or quaternion.shape != (4,) or not abs(length - 1) < 1e-3:
-        raise CaperError(f"{where} must be 3 numbers and a unit quaternion of 4, got {pose!r}")
-    w, x, y, z = quaternion / length
-    hat = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+def _placed(pose: Any) -> np.ndarray:
+    """[4, 4] of (position [3], quaternion [4] wxyz); ValueError for anything else."""
+    position, quaternion = pose if isinstance(pose, (tuple, list)) and len(pose) == 2 else ((), ())
+    position, quaternion = finite_array(position, (3,)), finite_array(quaternion, (4,))
+    if not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
+        raise ValueError("must have a unit quaternion")
     matrix = np.eye(4)
-    matrix[:3, :3] += 2 * (w * hat + hat @ hat)
+    matrix[:3, :3] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     matrix[:3, 3] = position
     return matrix
 
 
+_Pose = Annotated[np.ndarray, PlainValidator(_placed)]
+
+
+class _Truth(Schema):
+    """Content of gt/<frame>.pkl; link_pose is a list, or a dictionary by number of the link."""
+
+    camera_pose: _Pose
+    link_pose: dict[int, _Pose] | list[_Pose]
+
+
+class _Image(Schema):
+    """Content of cloud/<frame>.npz."""
+
+    camera_matrix: np.ndarray
+    depth: np.ndarray
+    seg: np.ndarray
+    near: Any
+    far: Any
+
+
+class CaptraDataset(DatasetReader):
+    """The frames of one category; names are ``<instance>/<track>/<frame>``, e.g. 10040/0/17.
+
+    Where both folders are read, names begin with theirs: ``render_seq/10040/0/17``. The split
+    "train" is render/, "test" is render_seq/.
+    """
+
+    format = "captra"
+    title = "CAPTRA"
+    mask_source = "simulated segmentation"
+    family = "captra"
+    has_official_split = True
+    has_videos = True
+
+    @classmethod
+    def categories_in(cls, root: Path) -> list[str]:
+        known = {name: cls._folder(categories.registered(name)) for name in cls.known_categories()}
+        return [
+            name
+            for name, folder in known.items()
+            if (root / "urdf" / folder).is_dir()
+            and any((root / place / folder).is_dir() for place in _PLACES.values())
+        ]
+
+    @classmethod
+    def splits_in(cls, root: Path, category: Category) -> list[str]:
+        folder = cls._folder(category)
+        return [split for split, place in _PLACES.items() if (root / place / folder).is_dir()]
+
+    @classmethod
+    def _folder(cls, category: Category) -> str:
+        return cls.conversion_of(category).folder
+
+    def open(self) -> None:
+        if self.split not in (ALL, *_PLACES):
+            raise unknown_name("split of CAPTRA", self.split, (ALL, *_PLACES))
+        self._urdfs = self.root / "urdf" / self.conversion.folder
+        self.need_folder(self._urdfs)
+
+    def list_frames(self) -> dict[str, Path]:
+        files = {}
+        for place in _PLACES.values() if self.split == ALL else (_PLACES[self.split],):
+            for path in (self.root / place / self.conversion.folder).glob("*/*/cloud/*.npz"):
+                name = f"{path.parts[-4]}/{path.parts[-3]}/{path.stem}"
+                files[f"{place}/{name}" if self.split == ALL else name] = path
+        return in_natural_order(files)
+
+    def videos(self) -> dict[str, list[int]]:
+        """Name of every track of render_seq/ -> indices of its frames in the order of time."""
+        tracks = group_videos(self.names)
+        files = [self._files[name] for name in self.names]
+        return {
+            name: indices
+            for name, indices in tracks.items()
+            if files[indices[0]].parts[-6] == _PLACES["test"]
+        }
+
+    def object_of(self, path: Path) -> str:
+        return path.parts[-4]
+
+    def read_model(self, object_id: str) -> Model:
+        return read_model(self._urdfs / object_id, self.category, self.conversion)
+
+    def read_frame(self, name: str, path: Path) -> Frame:
+        instance = self.object_of(path)
+        model: Model = self._model(instance)
+        poses = _read_poses(path.parent.parent / "gt" / f"{path.stem}.pkl", model.links)
+        truth = pose_of_parts(model, poses, self.category, str(path), scaled=False)
+        depth, seg, intrinsics = _read_image(path)
+        part_of_link = np.full(self.category.num_parts + 1, -1)
+        part_of_link[list(model.links)] = np.arange(self.category.num_parts)
+        known = (seg >= 0) & (seg < self.category.num_parts) & (depth > 0)
+        labels = part_of_link[np.where(known, seg, -1)]
+        return labeled_frame(name, depth, labels, intrinsics, truth, self.num_points, instance)
+
+
+def _read_poses(path: Path, links: tuple[int, ...]) -> list[ScaledPose]:
+    """Link -> camera (OpenCV) of links."""
+    truth = check_values(_Truth, safe_pickle.load(path), str(path))
+    world_to_camera = _CAMERA_AXES @ np.linalg.inv(truth.camera_pose)
+    poses = []
+    for link in links:
+        try:
+            pose = world_to_camera @ truth.link_pose[link]
+        except (KeyError, IndexError):
+            raise CaperError(f"{path}: link_pose lacks {link}") from None
+        poses.append(ScaledPose(1.0, pose[:3, :3], pose[:3, 3]))
+    return poses
+
+
 def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Depth [H, W] float32 meters (0: nothing), link of every pixel [H, W], intrinsics [3, 3]."""
-    content = safe_pickle.load_npz(path, "all_dict")
-    arrays = {}
-    for key, axes in _ARRAYS.items():
-        if not isinstance(content, dict) or key not in content:
-            raise CaperError(f"{path}: all_dict lacks {key!r}")
-        array = np.asarray(content[key])
-        numbers = array.dtype.kind in "fiu" and array.size and np.isfinite(array).all()
-        if array.ndim != axes or not numbers:
-            raise CaperError(
-                f"{path}: {key} must hold finite numbers with {axes} axes, got {array.dtype} "
-                f"{array.shape}"
-            )
-        arrays[key] = array.astype(np.float64)
-    buffer, seg, camera = arrays["depth"], arrays["seg"], arrays["camera_matrix"]
-    near, far = float(arrays["near"]), float(arrays["far"])
-    if seg.shape != buffer.shape:
-        raise CaperError(f"{path}: depth is {buffer.shape} but seg {seg.shape}")
-    if camera.shape != (3, 3) or camera[0, 0] <= 0 or camera[1, 1] <= 0:
-        raise CaperError(f"{path}: camera_matrix is no [3, 3] pinhole matrix, got {camera}")
-    if not 0 < near < far or buffer.min() < 0 or buffer.max() > 1:
-        raise CaperError(
-            f"{path}: depth must be a z-buffer from 0 to 1 between 0 < near < far, got "
-            f"{buffer.min():g} to {buffer.max():g} between {near:g} and {far:g}"
-        )
+    image = check_values(_Image, safe_pickle.load_npz(path, "all_dict"), f"{path}: all_dict")
+    near, far = (
+        float(checked_array(f"{path}: {key}", getattr(image, key), ())) for key in ("near", "far")
+    )
+    buffer = checked_array(f"{path}: depth", image.depth, (None, None), low=0, high=1)
+    buffer = buffer.astype(np.float64)
+    seg = checked_array(f"{path}: seg", image.seg, buffer.shape)
+    camera = checked_array(f"{path}: camera_matrix", image.camera_matrix, (3, 3))
+    if camera[0, 0] <= 0 or camera[1, 1] <= 0:
+        raise CaperError(f"{path}: camera_matrix is no pinhole camera, got {camera.tolist()}")
+    if not 0 < near < far:
+        raise CaperError(f"{path}: must have 0 < near < far, got {near:g} and {far:g}")
     depth = np.where(buffer < 1, near * far / (far + buffer * (near - far)), 0.0)
-    return depth.astype(np.float32), seg.astype(np.int64), camera
+    return depth.astype(np.float32), seg.astype(np.int64), camera.astype(np.float64)
+
+
+# The objects.
+
+
+def read_model(folder: Path, category: Category, conversion: CaptraConversion) -> Model:
+    """Reads one object and brings it to our rest pose and frame.
+
+    Args:
+      folder: the object's folder, which holds mobility.urdf and its meshes.
+      category: gives the parts and the types of joints.
+      conversion: of the category.
+
+    Returns:
+      The model; its file frames are those of the URDF's links.
+
+    Raises:
+      CaperError: missing or broken files, or an object that does not fit the category.
+    """
+    path = folder / "mobility.urdf"
+    robot = parse_urdf(path)
+    joints = {number_of(joint.child): joint for joint in read_joints(robot, path)}
+    root = _root(joints, path, category)
+    links = [root, *(link for link in range(category.num_parts) if link != root)]
+    visuals = [_read_visuals(robot, path, link) for link in links]
+
+    # Everything in the frame of the root's mesh, which is upright, as the file holds it.
+    upright = np.linalg.inv(visuals[0][0])
+    moving = [joints[link] for link in links[1:]]
+    poses = [upright, *(upright @ pose_of(joint.xyz, joint.rpy) for joint in moving)]
+    reference = MeshObject(
+        parts=tuple(mesh.moved(pose) for (_, mesh), pose in zip(visuals, poses, strict=True)),
+        kinds=tuple(joint.kind for joint in moving),
+        parents=category.parents,
+        axis=np.array([p[:3, :3] @ j.axis for j, p in zip(moving, poses[1:], strict=True)]),
+        pivot=np.array([pose[:3, 3] for pose in poses[1:]]),
+        limits=np.array([joint.limits for joint in moving]),
+    )
+    rule = category.urdf_rule
+    if conversion.lower_root:
+        first, second = (mesh.bounds()[:, 1].mean() for mesh in reference.parts)
+        exchanged = second < first
+    else:
+        exchanged = rule.root is not None and rule.root(reference) == 1
+    if exchanged:
+        reference, links, poses = reference.exchanged(), links[::-1], poses[::-1]
+
+    states = rule.rest(reference)
+    at_rest = reference.at(states)
+    low, high = at_rest.limits.T
+    rest = RestObject(
+        points=[mesh.vertices for mesh in at_rest.parts],
+        axis=at_rest.axis,
+        pivot=at_rest.pivot,
+        opening=np.where(high >= -low, 1.0, -1.0),
+    )
+    if conversion.front is None:
+        axes = _urdf_axes(at_rest, category)
+    else:
+        axes = canonical_axes(rest, category, conversion.front, str(path))
+    model = rest_model(rest, reference.poses(states) @ np.array(poses), axes)
+    return replace(model, links=tuple(links[part] for part in axes.order))
+
+
+def _urdf_axes(at_rest: MeshObject, category: Category) -> AxisMap:
+    """As the category's rule for URDF files has them, with joints that open about up."""
+    up, front, _ = category.urdf_rule.axes(at_rest)
+    front = front - (front @ up) * up
+    y, z = up / np.linalg.norm(up), front / np.linalg.norm(front)
+    rotation = np.stack([np.cross(y, z), y, z])
+    return AxisMap(rotation, tuple(range(category.num_parts)), np.sign(at_rest.axis @ y))
+
+
+def _root(joints: dict[int | None, UrdfJoint], path: Path, category: Category) -> int:
+    """The link that all others hang on; checks the tree against the category's."""
+    links = set(range(category.num_parts))
+    roots = [n for n in links if n not in joints or joints[n].kind == "fixed"]
+    tree = {link: (joint.kind, number_of(joint.parent)) for link, joint in joints.items()}
+    if len(roots) == 1:
+        moving = {link: place for link, place in tree.items() if link != roots[0]}
+        on_base = tree.get(roots[0], (None, None))[1] is None
+        if on_base and moving == dict.fromkeys(
+            links - {roots[0]}, (category.joint_types[0], roots[0])
+        ):
+            return roots[0]
+    raise CaperError(
+        f"{path}: joints (link: type, parent) are {tree}, but {category.name} has "
+        f"{category.num_joints} {category.joint_types[0]} joint(s) on one root, of links link_0 to "
+        f"link_{category.num_parts - 1}"
+    )
+
+
+def _read_visuals(robot: ElementTree.Element, path: Path, number: int) -> tuple[np.ndarray, Mesh]:
+    """Pose [4, 4] of a link's first mesh in the link, and all its meshes in the link's frame."""
+    poses, meshes = [], []
+    for visual in robot.iterfind(f"link[@name='link_{number}']/visual"):
+        geometry = visual.find("geometry/mesh")
+        if geometry is None or not geometry.get("filename"):
+            raise CaperError(f"{path}, link_{number}: a <visual> lacks <mesh filename=...>")
+        where = f"{path}, link_{number}, visual"
+        pose = pose_of_origin(visual, where)
+        mesh = read_mesh(path.parent / str(geometry.get("filename")))
+        if not len(mesh.faces):
+            raise CaperError(f"{path.parent / str(geometry.get('filename'))}: has no faces")
+        scale = vector(geometry.get("scale", "1 1 1"), f"{where} scale")
+        poses.append(pose)
+        meshes.append(mesh.scaled(scale).moved(pose))
+    if not meshes:
+        raise CaperError(f"{path}: no link_{number} with a mesh")
+    return poses[0], join(meshes)

@@ -12,16 +12,14 @@ A root is one such folder, or a folder of several. Frames come in the natural or
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from caper_jax import categories
-from caper_jax.articulation.category import Category
 from caper_jax.data.clouds import MIN_POINTS, cloud_from_depth
 from caper_jax.data.images import read_depth, read_intrinsics, read_mask
-from caper_jax.data.readers.listing import natural_order
+from caper_jax.data.readers.base import ALL, DatasetReader, natural_order
 from caper_jax.data.types import Frame
 from caper_jax.errors import CaperError
 
@@ -29,62 +27,47 @@ FORMAT = "folder"
 _DEPTH, _MASK, _CAMERA = "depth", "mask", "intrinsics.json"
 
 
-class DepthFolder:
-    """The frames of all videos of a root; names are ``<video>/<file>``, e.g. kitchen/000012.
-
-    A frame that shows too little for a cloud has no points: the object is not in it.
-
-    Attributes:
-      category, format, split, mask_source, names: see ``Dataset``.
-    """
+class DepthFolder(DatasetReader):
+    """The frames of all videos of a root; names are ``<video>/<file>``, e.g. kitchen/000012."""
 
     format = FORMAT
-    split = "all"
+    title = "depth folder"
     mask_source = "mask images"
+    has_videos = True
+    labeled = False
 
     def __init__(
-        self,
-        root: str | Path,
-        category: str,
-        num_points: int = 1024,
-        depth_scale: float | None = None,
+        self, root: str | Path, *arguments: Any, depth_scale: float | None = None, **options: Any
     ):
-        """Lists the frames and reads the cameras; images are read when a frame is.
-
-        Args:
-          root: a video, or a folder of videos.
-          category: what the videos show.
-          num_points: points per frame.
-          depth_scale: meters per unit of the depth images, see ``read_depth``.
-
-        Raises:
-          CaperError: no such folder, no video in it, a video without depth images, masks or a
-            camera, or a mask without a depth image.
-        """
-        self.root = Path(root)
-        self.category: Category = categories.get(category)
-        self._num_points = num_points
+        """See ``DatasetReader``; ``depth_scale``: meters per unit of the depth images."""
         self._scale = depth_scale
-        self._files: dict[str, Path] = {}
-        self._videos: dict[str, list[int]] = {}
-        for home in _homes(self.root):
-            files = _depth_images(home)
+        super().__init__(root, *arguments, **options)
+
+    @classmethod
+    def categories_in(cls, root: Path) -> list[str]:
+        raise CaperError(f"{root}: depth images do not say what they show; name the category")
+
+    def open(self) -> None:
+        super().open()
+        if self.split != ALL:
+            raise CaperError(f"{self.root}: a folder of depth images has no splits")
+        self._homes = _videos_in(self.root)
+        if not self._homes:
+            raise CaperError(
+                f"{self.root}: no video of depth images (it has no folder {_DEPTH}/, nor has a "
+                "folder in it)"
+            )
+
+    def list_frames(self) -> dict[str, Path]:
+        frames = {}
+        for home in self._homes:
             read_intrinsics(home / _CAMERA)
-            first, name = len(self._files), _name(home)
-            self._videos[name] = list(range(first, first + len(files)))
-            self._files |= {f"{name}/{file.stem}": file for file in files}
-        self.names: Sequence[str] = list(self._files)
+            # As given: links of different names may lead to folders of the same.
+            name = home.resolve().name if home.name in ("", "..") else home.name
+            frames.update({f"{name}/{file.stem}": file for file in _depth_images(home)})
+        return frames
 
-    def videos(self) -> dict[str, list[int]]:
-        """Name of every video -> indices of its frames, in the order of time."""
-        return self._videos
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __getitem__(self, index: int, /) -> Frame:
-        name = self.names[index]
-        path = self._files[name]
+    def read_frame(self, name: str, path: Path) -> Frame:
         home = path.parent.parent
         depth = read_depth(path, self._scale)
         intrinsics = read_intrinsics(home / _CAMERA, (depth.shape[0], depth.shape[1]))
@@ -99,38 +82,22 @@ class DepthFolder:
             )
         points = np.zeros((0, 3), np.float32)
         if np.count_nonzero(mask & np.isfinite(depth) & (depth > 0)) >= MIN_POINTS:
-            points = cloud_from_depth(depth, mask, intrinsics, self._num_points).points
+            points = cloud_from_depth(depth, mask, intrinsics, self.num_points).points
         return Frame(name=name, points=points, depth=depth, mask=mask, intrinsics=intrinsics)
 
 
 def is_depth_folder(root: str | Path) -> bool:
     """Whether a folder is a video of this layout, or holds one."""
     root = Path(root)
-    return root.is_dir() and bool(_folders(root))
+    return root.is_dir() and bool(_videos_in(root))
 
 
-def _folders(root: Path) -> list[Path]:
+def _videos_in(root: Path) -> list[Path]:
+    """The folders of the videos of a root, in natural order."""
     if (root / _DEPTH).is_dir():
         return [root]
     inside = [folder for folder in root.iterdir() if (folder / _DEPTH).is_dir()]
     return sorted(inside, key=lambda folder: natural_order(folder.name))
-
-
-def _homes(root: Path) -> list[Path]:
-    """The videos of a root, in natural order; at least one."""
-    if not root.is_dir():
-        raise CaperError(f"{root}: no such folder")
-    homes = _folders(root)
-    if not homes:
-        raise CaperError(
-            f"{root}: no video of depth images (it has no folder {_DEPTH}/, nor has a folder in it)"
-        )
-    return homes
-
-
-def _name(home: Path) -> str:
-    """The name of a folder, as given: links of different names may lead to folders of the same."""
-    return home.resolve().name if home.name in ("", "..") else home.name
 
 
 def _depth_images(home: Path) -> list[Path]:
