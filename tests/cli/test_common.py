@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import io
 import os
 import shutil
 import subprocess
@@ -17,14 +16,8 @@ from caper_jax import cli
 from caper_jax.cli import common
 from caper_jax.errors import CaperError
 from caper_jax.estimator import shipped_weights
-from caper_jax.progress import format_seconds, progress
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
 
 
 def raising(error: BaseException):
@@ -139,50 +132,6 @@ def test_check_folder(tmp_path):
 def test_demo_rejects_a_category_without_frames(capsys):
     assert cli.main(["demo", "--category", "teapot"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
-
-
-def test_progress_prints_lines_every_few_seconds_when_not_a_terminal():
-    stream, now = io.StringIO(), [0.0]
-    with progress("training", 40, start=10, stream=stream, clock=lambda: now[0]) as bar:
-        for step in range(30):
-            now[0] += 0.5
-            bar.update(1, loss=1 / (step + 1), rate="2 steps/s")
-    assert stream.getvalue().splitlines() == [
-        "training: 10/40 (25 %), 0 s",
-        "training: 20/40 (50 %), 5 s, 10 s left, loss 0.1  rate 2 steps/s",
-        "training: 30/40 (75 %), 10 s, 5 s left, loss 0.05  rate 2 steps/s",
-        "training: 40/40 (100 %), 15 s, loss 0.03333  rate 2 steps/s",
-    ]
-
-
-def test_progress_without_total():
-    stream = io.StringIO()
-    with progress("reading", stream=stream, clock=lambda: 0.0) as bar:
-        bar.update(3)
-    assert stream.getvalue().splitlines() == ["reading: 0, 0 s", "reading: 3, 0 s"]
-
-
-def test_progress_draws_a_bar_on_a_terminal_only(monkeypatch):
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    bars = Terminal()
-    with progress("work [1]", 4, stream=bars) as bar:
-        bar.update(4, loss=0.5)
-    assert "\x1b[" in bars.getvalue()
-    assert "work [1]" in bars.getvalue()
-    assert "loss 0.5" in bars.getvalue()
-    for name, value in (("NO_COLOR", "1"), ("TERM", "dumb")):
-        with monkeypatch.context() as patch:
-            patch.setenv(name, value)
-            plain = Terminal()
-            with progress("work", 4, stream=plain) as bar:
-                bar.update(4)
-            assert "\x1b" not in plain.getvalue()
-            assert plain.getvalue().endswith("work: 4/4 (100 %), 0 s\n")
-
-
-def test_format_seconds():
-    assert [format_seconds(s) for s in (0.4, 59.4, 185, 7385)] == ["0 s", "59 s", "3:05", "2:03:05"]
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
