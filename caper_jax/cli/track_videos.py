@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,7 +11,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from caper_jax.cli.track import VIDEO_FORMATS
 from caper_jax.config import to_dict
 from caper_jax.data.readers import open_dataset
 from caper_jax.data.readers.depth_folder import FORMAT as FOLDER
@@ -20,15 +18,18 @@ from caper_jax.data.readers.depth_folder import DepthFolder, is_depth_folder
 from caper_jax.data.types import Dataset, Frame
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.estimator import load
+from caper_jax.evaluation.records import json_line
 from caper_jax.evaluation.report import METRICS_FILE
-from caper_jax.evaluation.track_report import format_tracks, json_line, track_records
-from caper_jax.evaluation.tracking import Track, summarize_tracks, track_video
+from caper_jax.evaluation.track_report import format_tracks, track_records
+from caper_jax.evaluation.tracking import Start, Track, summarize_tracks, track_video
 from caper_jax.files import write_atomically
 from caper_jax.progress import Progress, progress
 from caper_jax.tracker import Tracker, config_for
 from caper_jax.tracking.step import TrackResult
 from caper_jax.visualization.scene import Scene
 from caper_jax.visualization.track import Tile, evenly_spaced, write_sheet, write_states
+
+VIDEO_FORMATS = ("caper", "captra", "folder", "pm-videos", "reart-videos")
 
 
 class Recorder(Tracker):
@@ -65,38 +66,53 @@ def load_recorder(
 
 
 def open_videos(
-    arguments: argparse.Namespace, category: str
+    data: Path,
+    category: str,
+    *,
+    format: str | None = None,
+    split: str | None = None,
+    official_split: bool = False,
+    depth_scale: float | None = None,
 ) -> tuple[Dataset, dict[str, list[int]]]:
-    """The dataset and the chosen videos: name -> indices of the frames, in the order of time.
+    """The dataset and its videos: name -> indices of the frames, in the order of time.
 
     Raises:
-      CaperError: no such data, a layout that cannot be told or has no videos, options that do not
-        go with it, or a video that it does not hold.
+      CaperError: no such data, a layout that cannot be told or has no videos, or options that do
+        not go with it.
     """
-    layout = arguments.format or _guess_format(arguments.data)
+    layout = format or _guess_format(data)
     if layout not in VIDEO_FORMATS:
         raise unknown_name("format of videos", layout, VIDEO_FORMATS)
     dataset: Dataset
     if layout == FOLDER:
-        if arguments.split is not None or arguments.official_split:
+        if split is not None or official_split:
             raise CaperError("--split and --official-split: a folder of depth images has no splits")
-        dataset = DepthFolder(arguments.data, category, depth_scale=arguments.depth_scale)
+        dataset = DepthFolder(data, category, depth_scale=depth_scale)
     else:
-        if arguments.depth_scale is not None:
+        if depth_scale is not None:
             raise CaperError(f"--depth-scale goes with --format {FOLDER}, not {layout}")
-        dataset = open_dataset(
-            layout, arguments.data, category, arguments.split, arguments.official_split
-        )
+        dataset = open_dataset(layout, data, category, split, official_split)
     videos: dict[str, list[int]] = dataset.videos()  # type: ignore[attr-defined]
     if not videos:
         raise CaperError(
-            f"{arguments.data}: holds single frames, no videos; measure them with caper evaluate"
+            f"{data}: holds single frames, no videos; measure them with caper evaluate"
         )
-    for name in arguments.video or ():
+    return dataset, videos
+
+
+def choose(
+    videos: dict[str, list[int]], names: Sequence[str], count: int | None
+) -> dict[str, list[int]]:
+    """The videos of these names, or all; at most so many.
+
+    Raises:
+      CaperError: a video that is not there.
+    """
+    for name in names:
         if name not in videos:
             raise unknown_name("video", name, videos)
-    chosen = [name for name in videos if arguments.video is None or name in arguments.video]
-    return dataset, {name: videos[name] for name in chosen[: arguments.limit]}
+    chosen = [name for name in videos if not names or name in names]
+    return {name: videos[name] for name in chosen[:count]}
 
 
 def _guess_format(data: Path) -> str:
@@ -110,32 +126,37 @@ def _guess_format(data: Path) -> str:
 
 
 def track_all(
-    arguments: argparse.Namespace,
     tracker: Recorder,
     dataset: Dataset,
     videos: dict[str, list[int]],
+    out: Path,
+    *,
+    start: Start,
+    given_masks: bool,
+    weights: Path | None,
 ) -> None:
-    """Tracks through the videos, writes everything to ``--out`` and prints the tables.
+    """Tracks through the videos, writes everything to a folder and prints the tables.
 
     Every video's files are written before the next one begins.
+
+    Args:
+      tracker: of the dataset's category.
+      dataset, videos: see ``open_videos``.
+      out: the folder; made where it is missing.
+      start, given_masks: see ``track_video``.
+      weights: where the model came from, for metrics.json; None for the one that ships.
     """
-    category, config, out = dataset.category, tracker.config, arguments.out
-    threshold = config.threshold if config.policy in ("dynamic", "promote") else None
+    category, config = dataset.category, tracker.config
     out.mkdir(parents=True, exist_ok=True)
     tracks = []
     with progress("loading, compiling, tracking", sum(map(len, videos.values()))) as bar:
         for (name, indices), stem in zip(videos.items(), file_stems(videos), strict=True):
             kept: dict[int, Frame] = {}
             frames = _frames(dataset, indices, kept, bar)
-            track = track_video(tracker, name, frames, arguments.start, arguments.given_masks)
-            lines = "".join(json_line(row) + "\n" for row in track_records(track, category))
-            write_atomically(out / f"{stem}.jsonl", lines.encode())
-            tiles = [_tile(number, frame, track, tracker) for number, frame in kept.items()]
-            write_sheet(out / f"{stem}.png", name, tiles)
-            write_states(out / f"{stem}_states.png", track, category, threshold)
+            track = track_video(tracker, name, frames, start, given_masks)
+            _write_video(out, stem, track, kept, tracker)
             tracks.append(track)
-    part_masks = "given" if arguments.given_masks else "predicted"
-    facts = (arguments.start, dataset.mask_source, part_masks)
+    facts = (start, dataset.mask_source, "given" if given_masks else "predicted")
     measured = [track for track in tracks if track.truth is not None]
     metrics = None
     (out / METRICS_FILE).unlink(missing_ok=True)  # an earlier run's would stand beside these tracks
@@ -144,7 +165,7 @@ def track_all(
         metrics |= {
             "format": dataset.format,
             "split": dataset.split,
-            "weights": str(arguments.weights or f"shipped with the package ({category.name})"),
+            "weights": str(weights or f"shipped with the package ({category.name})"),
             "tracker": to_dict(config),
         }
         text = json.dumps(metrics, indent=2, allow_nan=False)
@@ -154,6 +175,19 @@ def track_all(
     stem = file_stems(videos)[0] if len(videos) == 1 else "<video>"
     written += [f"{stem}.jsonl", f"{stem}.png", f"{stem}_states.png"]
     print(f"\nwritten to {out}: {', '.join(written)}")
+
+
+def _write_video(
+    out: Path, stem: str, track: Track, kept: dict[int, Frame], tracker: Recorder
+) -> None:
+    """Poses, contact sheet and curves of one video."""
+    category, config = tracker.estimator.category, tracker.config
+    lines = "".join(json_line(row) + "\n" for row in track_records(track, category))
+    write_atomically(out / f"{stem}.jsonl", lines.encode())
+    tiles = [_tile(number, frame, track, tracker) for number, frame in kept.items()]
+    write_sheet(out / f"{stem}.png", track.name, tiles)
+    threshold = config.threshold if config.policy in ("dynamic", "promote") else None
+    write_states(out / f"{stem}_states.png", track, category, threshold)
 
 
 def file_stems(videos: Iterable[str]) -> list[str]:

@@ -13,7 +13,7 @@ from _helpers.tiny import HS, random_like
 from benchmarks import __main__ as benchmark
 from benchmarks import gate, iou, naive, profile, se3, timing
 from benchmarks.models import chain, random_estimator
-from caper_jax import cli, machine
+from caper_jax import machine
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.config import PRESETS, preset
 from caper_jax.errors import CaperError
@@ -84,14 +84,14 @@ def test_gate_measures_again_before_it_fails(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(gate, "measured", lambda: {name: (name, None) for name in BASELINE})
     found = {"estimator": iter([1.0, 2.1]), "log": iter([0.1, 0.2])}
     monkeypatch.setattr(gate, "ratio", lambda ours, reference, repeats: next(found[ours]))
-    assert cli.main(["benchmark", "gate", "--baseline", str(path)]) == 1
+    assert benchmark.main(["gate", "--baseline", str(path)]) == 1
     captured = capsys.readouterr()
     assert "log        " in captured.err and "-50 %" in captured.err
     assert "estimator" not in captured.err  # a busy moment, the second time it was as before
 
     found.update({"estimator": iter([5.0]), "log": iter([0.5])})
-    arguments = ["benchmark", "gate", "--update", "--baseline", str(path)]
-    assert cli.main([*arguments, "--json", str(tmp_path / "out.json")]) == 0
+    arguments = ["gate", "--update", "--baseline", str(path)]
+    assert benchmark.main([*arguments, "--json", str(tmp_path / "out.json")]) == 0
     own = {"estimator": 5.0, "log": 0.5}
     assert gate.read_baselines(path) == {"other": {"log": 9.0}, machine.processor(): own}
     report = json.loads((tmp_path / "out.json").read_text())
@@ -100,7 +100,7 @@ def test_gate_measures_again_before_it_fails(monkeypatch, tmp_path, capsys):
     path.write_text(json.dumps({"other": {"log": 9.0}}))
     found.update({"estimator": iter([1.0]), "log": iter([0.1])})
     capsys.readouterr()
-    assert cli.main(["benchmark", "gate", "--baseline", str(path)]) == 0
+    assert benchmark.main(["gate", "--baseline", str(path)]) == 0
     assert "no baseline of a" in capsys.readouterr().err
 
 
@@ -185,14 +185,14 @@ def test_a_chain_of_parts():
 
 
 def test_benchmarks_are_listed(capsys):
-    assert cli.main(["benchmark", "--help"]) == 0
+    assert benchmark.main(["--help"]) == 0
     output = capsys.readouterr().out
     assert all(f"    {name}" in output for name in benchmark.SUMMARIES)
 
 
 @pytest.mark.parametrize("name", [*benchmark.SUMMARIES, "--gate"])
 def test_every_benchmark_has_help(name, capsys):
-    assert cli.main(["benchmark", name, "--help"]) == 0
+    assert benchmark.main([name, "--help"]) == 0
     assert "--json" in capsys.readouterr().out
 
 

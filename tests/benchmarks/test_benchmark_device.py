@@ -22,7 +22,7 @@ from benchmarks import (
     tracker,
     training,
 )
-from caper_jax import categories, cli
+from caper_jax import categories
 from caper_jax import estimator as estimators
 from caper_jax.config import GeneratorConfig
 from caper_jax.training import parallel
@@ -125,7 +125,7 @@ def test_kept_programs(kept, monkeypatch, capsys):
     anew = []
     monkeypatch.setattr(benchmark, "_compile_anew", lambda: anew.append(True))
     monkeypatch.setattr(generator, "run", lambda arguments: iter([{"compile_s": 12.5}]))
-    assert cli.main(["benchmark", "generator", *["--keep-programs"] * kept]) == 0
+    assert benchmark.main(["generator", *["--keep-programs"] * kept]) == 0
     output = capsys.readouterr().out
     assert anew == [True] * (not kept)
     assert ("12.5" in output, "programs kept" in output) == (not kept, kept)

@@ -12,7 +12,6 @@ import pytest
 
 from benchmarks import __main__ as benchmark
 from benchmarks import cost_model, processes, worker
-from caper_jax import cli
 from caper_jax.errors import CaperError
 from caper_jax.estimator import load
 from caper_jax.training import parallel
@@ -173,5 +172,5 @@ def test_the_model_on_paper(monkeypatch, capsys):
     assert many["batch_norms_local_%"] == pytest.approx(local, abs=0.1)
 
     given = ["--model", "--preset", "paper", "--step-ms", "80"]
-    assert cli.main(["benchmark", "processes", *given]) == 0
+    assert benchmark.main(["processes", *given]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 2 + 3
