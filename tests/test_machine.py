@@ -20,20 +20,23 @@ from caper_jax import cli, machine
 from caper_jax.cli import validate
 machine._WORTH_KEEPING = 0.0
 
-def main(argv):
+def main(options):
     import jax
     jax.jit(lambda x: x * 2 + 1)(jax.numpy.ones(3)).block_until_ready()
     print(jax.config.jax_compilation_cache_dir)
     return 0
 
-validate.main = main
+validate.parse, validate.run = list, main
 sys.exit(cli.main(["validate"]))
 """
 
 
+_OWN = (machine.SWITCH, "XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR")
+
+
 def run(**environment: str) -> str:
     """What the program prints, with these variables; it must succeed and say nothing else."""
-    kept = {k: v for k, v in os.environ.items() if k not in (machine.SWITCH, "XDG_CACHE_HOME")}
+    kept = {name: value for name, value in os.environ.items() if name not in _OWN}
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM],
         capture_output=True,
@@ -61,7 +64,7 @@ def test_commands_keep_what_they_compile(tmp_path):
 
 
 def test_without_a_home_there_is_no_cache_and_no_complaint(tmp_path):
-    assert run(HOME=str(tmp_path / "absent")) == "None"
+    assert machine.keep_programs({"HOME": str(tmp_path / "absent")}) is None
     assert not (tmp_path / "absent").exists()
 
 
@@ -119,7 +122,10 @@ def test_the_library_keeps_nothing(tmp_path):
         capture_output=True,
         text=True,
         cwd=ROOT,
-        env={**os.environ, "CAPER_CACHE": "", "XDG_CACHE_HOME": str(tmp_path)},
+        env={
+            **{name: value for name, value in os.environ.items() if name not in _OWN},
+            "XDG_CACHE_HOME": str(tmp_path),
+        },
         check=True,
     )
     assert done.stdout.strip() == "None"

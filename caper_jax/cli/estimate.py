@@ -67,6 +67,12 @@ class Estimate:
     object_scale: Positive = 1.0
     camera_roll: float = 0.0
 
+    @property
+    def source(self) -> Path:
+        path = self.depth or self.points
+        assert path is not None  # one of them is given
+        return path
+
 
 @dataclass(frozen=True)
 class _Observation:
@@ -102,8 +108,8 @@ def run(options: Estimate) -> int:
     estimator = load(category.name, options.weights, options.object_scale, options.camera_roll)
     prediction = estimator(cloud.points[None])
     prediction = jax.tree.map(lambda array: np.asarray(array)[0], prediction)
-    scene = _scene(options, category, observation, prediction)
-    record = estimate_record(scene.name, prediction, category, cloud)
+    record = estimate_record(options.source.name, prediction, category, cloud)
+    scene = _scene(options.source.name, category, observation, prediction)
 
     print(format_scene(scene))
     print(f"{cloud.available} points, {cloud.dropped} dropped")
@@ -171,8 +177,8 @@ def _observe(options: Estimate) -> _Observation:
     if options.points is not None:
         points = read_points(options.points)
         return _Observation(sample_points(points, NUM_POINTS, where=str(options.points)))
-    assert options.depth is not None and options.intrinsics is not None
-    depth = read_depth(options.depth, options.depth_scale)
+    assert options.intrinsics is not None
+    depth = read_depth(options.source, options.depth_scale)
     intrinsics = read_intrinsics(options.intrinsics, (depth.shape[0], depth.shape[1]))
     if options.mask is not None:
         mask = read_mask(options.mask)
@@ -208,7 +214,7 @@ def _certainty(prediction: Prediction, category: Category) -> str:
 
 
 def _scene(
-    options: Estimate, category: Category, observation: _Observation, prediction: Prediction
+    name: str, category: Category, observation: _Observation, prediction: Prediction
 ) -> Scene:
     """The estimate with what it was made from, to print and to draw."""
     import numpy as np
@@ -216,10 +222,8 @@ def _scene(
     from caper_jax.visualization.scene import Scene
 
     depth = observation.depth
-    source = options.depth or options.points
-    assert source is not None
     return Scene(
-        name=source.name,
+        name=name,
         category=category,
         points=prediction.points,
         labels=prediction.labels,
