@@ -31,6 +31,11 @@ EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
 
 ALL = "all"
 _HELP_SETTINGS = "--help-settings"
+# tyro's words for a number that is none, of an option that has a default and of one that has not.
+_WRONG_NUMBER = re.compile(
+    r"Error parsing (\S+): (?:no type matching (?:INT|FLOAT) .*|invalid literal for int.*"
+    r"|could not convert string to float.*)'(.*)'"
+)
 
 
 @dataclass(frozen=True)
@@ -92,7 +97,7 @@ def parse(
             raise _mistake(complaint.getvalue(), options) from None
         print(_without_boxes(shown.getvalue()) + _format_examples(prog, examples) + notes, end="")
         raise
-    for each in fields(options):
+    for each in fields(options):  # type: ignore[arg-type]
         if getattr(parsed, each.name) == () and each.default is MISSING:
             raise CaperError(f"missing {flag(options, each.name)}")
     if unknown:
@@ -183,7 +188,7 @@ def _print_settings(settings: Settings, prog: str) -> None:
 class _Captured(io.StringIO):
     """What tyro prints, always framed in the same way."""
 
-    encoding = "utf-8"  # type: ignore[assignment]
+    encoding = "utf-8"
 
 
 def _without_boxes(text: str) -> str:
@@ -220,10 +225,9 @@ def _mistake(complaint: str, options: Any) -> CaperError:
     message = " ".join(text).partition(" Got errors:")[0]
     if message.startswith("Missing from"):
         return CaperError(f"missing {', '.join(re.findall(r'--[a-z-]+', message))}")
-    if wrong := re.match(r"Error parsing (\S+): no type matching (\S+) .*from \['(.*)'\]", message):
-        option, kind, value = wrong.groups()
-        kind = {"INT": "whole number", "FLOAT": "number"}.get(kind, kind)
-        return CaperError(f"{option}: {value!r} is no {kind}")
+    if wrong := _WRONG_NUMBER.match(message):
+        kind = "whole number" if re.search(r"\bint\b", message, re.IGNORECASE) else "number"
+        return CaperError(f"{wrong[1]}: {wrong[2]!r} is no {kind}")
     return CaperError(message.removeprefix("Error parsing "))
 
 
