@@ -127,7 +127,7 @@ class Reproduce:
       object_scale: the objects are so many times as large as those the model was trained on, e.g.
         3.7 for the laptops of PM-Videos and ArtImage (PartNet units read as meters)
       seed: of generated frames and videos
-      noise: of generated depth: none, gauss3mm, kinect or realsense (default: kinect)
+      noise: of generated depth (default: kinect)
       given_masks: add rows with the data's part labels
       network_alone: track without registration, as the paper does
       seeds: runs to train of each kind
@@ -148,7 +148,7 @@ class Reproduce:
     weights: Path | None = None
     object_scale: Positive = 1.0
     seed: Size = 0
-    noise: str | None = None
+    noise: Literal["none", "gauss3mm", "kinect", "realsense"] | None = None
     given_masks: bool = False
     network_alone: bool = False
     seeds: Count = 3
