@@ -156,6 +156,8 @@ def split_settings(argv: Sequence[str], sections: Iterable[str]) -> tuple[list[s
             rest.append(argument)
             continue
         value = value if equals else next(arguments, "")
+        if value.startswith("--"):  # the next option
+            value = ""
         key = option[2:]
         if not named:
             key, _, value = value.partition("=")
