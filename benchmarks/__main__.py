@@ -1,4 +1,4 @@
-"""``caper benchmark``: how fast the parts of this program are on this machine."""
+"""``bin/benchmark``: how fast the parts of this program are on this machine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.arguments import create_parser
 from caper_jax.cli import common
+from caper_jax.errors import CaperError
 from caper_jax.machine import machine
 
 # Subcommand -> one line for --help; the module of the same name in benchmarks/ holds it.
@@ -32,8 +34,8 @@ SUMMARIES = {
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = common.create_parser(
-        "benchmark",
+    parser = create_parser(
+        "bin/benchmark",
         "Measures speed after compilation, on this machine and with whatever else runs on it:\n"
         "the load average is printed with the result.",
         [
@@ -44,13 +46,14 @@ def build_parser() -> argparse.ArgumentParser:
             ("generator --category box --json speed.json", "one category, kept in a file"),
             ("loader --category box --data box.h5", "feeding from disk against memory"),
             ("tracker --category laptop", "frames/s of the tracker, beside the estimator"),
-            ("generator --category box --set table=0.5", "with table pixels in half the masks"),
+            ("generator --category box --data.table 0.5", "with table pixels in half the masks"),
             ("profile --plot profile.png", "what takes the time, as a picture"),
             ("processes --model --preset fast --step-ms 20", "many devices on paper"),
             ("gate", "exit code 1 where a ratio fell by a quarter"),
         ],
     )
     commands = parser.add_subparsers(dest="benchmark", required=True, metavar="BENCHMARK")
+    parser.set_defaults(settings=[])
     for name, summary in SUMMARIES.items():
         command = commands.add_parser(name, help=summary, description=summary)
         _module(name).add_arguments(command)
@@ -71,7 +74,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv[:1] == ["--gate"]:  # what such a guard is called elsewhere
         argv[0] = "gate"
+    argv, settings = common.split_settings(argv, ("data",))
     arguments = build_parser().parse_args(argv)
+    if settings and arguments.benchmark != "generator":
+        raise CaperError(f"{settings[0]}: only the generator's benchmark takes settings")
+    arguments.settings = [setting.removeprefix("data.") for setting in settings]
     if arguments.json is not None:
         common.check_folder(arguments.json.parent, "--json")
     if not arguments.keep_programs:
@@ -109,3 +116,7 @@ def _compile_anew() -> None:
 
 def _shown(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+if __name__ == "__main__":
+    sys.exit(common.run(main, sys.argv[1:], command="benchmark"))

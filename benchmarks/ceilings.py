@@ -1,4 +1,4 @@
-"""``caper benchmark ceilings``: what the device does at most, measured by large operations."""
+"""``bin/benchmark ceilings``: what the device does at most, measured by large operations."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from functools import cache
 from typing import Any
 
 from benchmarks import timing
+from benchmarks.arguments import positive_int
 from caper_jax import machine
-from caper_jax.cli import common
 
 # Rows and columns of the matrices, and numbers copied: large enough that a call costs nothing
 # beside its work and that no cache holds them, small enough for a processor's patience.
@@ -19,16 +19,16 @@ _SIZES = {"accelerator": (8192, 2**28), "cpu": (1024, 2**25)}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--size",
-        type=common.positive_int,
+        type=positive_int,
         help="rows of the matrices (default: 8192, on a CPU 1024)",
     )
     parser.add_argument(
         "--numbers",
-        type=common.positive_int,
+        type=positive_int,
         help="float32 numbers that are copied (default: 2^28, on a CPU 2^25)",
     )
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=20, help="runs (default: %(default)s)"
+        "--repeats", type=positive_int, default=20, help="runs (default: %(default)s)"
     )
 
 

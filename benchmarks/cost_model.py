@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from benchmarks.arguments import positive_float, positive_int
 from benchmarks.training import TARGETS
-from caper_jax.cli import common
 from caper_jax.errors import CaperError
 
 DEVICES = (1, 8, 64)
@@ -55,7 +55,7 @@ def add_arguments(parser: Any) -> None:
     )
     parser.add_argument(
         "--step-ms",
-        type=common.positive_float,
+        type=positive_float,
         help="of one device, with --preset (default: measured on this one)",
     )
     for name, default, text in (
@@ -67,7 +67,7 @@ def add_arguments(parser: Any) -> None:
     ):
         parser.add_argument(
             f"--{name}",
-            type=common.positive_int if isinstance(default, int) else common.positive_float,
+            type=positive_int if isinstance(default, int) else positive_float,
             default=default,
             help=f"{text} (default: %(default)g)",
         )

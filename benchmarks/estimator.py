@@ -1,4 +1,4 @@
-"""``caper benchmark estimator``: points to poses, both stages."""
+"""``bin/benchmark estimator``: points to poses, both stages."""
 
 from __future__ import annotations
 
@@ -7,15 +7,19 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from benchmarks import costs, timing
+from benchmarks.arguments import positive_int
 from caper_jax import machine
-from caper_jax.cli import common
 
 # Clouds per second to reach on two CPU cores, by preset and batch.
 TARGETS = {("fast", 1): 100, ("fast", 32): 200, ("paper", 1): 12}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--category", action="append", help="may be repeated (default: all)")
+    parser.add_argument(
+        "--category",
+        action="append",
+        help="may be repeated, listed with commas, or all (default: all)",
+    )
     parser.add_argument(
         "--preset",
         choices=("fast", "paper"),
@@ -26,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--batch",
         action="append",
-        type=common.positive_int,
+        type=positive_int,
         help="clouds, may be repeated (default: 1 and 32; of paper 1)",
     )
     parser.add_argument(
@@ -35,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also with factors rounded to bfloat16: how much faster, how far off",
     )
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=30, help="runs (default: %(default)s)"
+        "--repeats", type=positive_int, default=30, help="runs (default: %(default)s)"
     )
 
 
@@ -44,11 +48,10 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
     One cloud comes from the host, as from a camera; those of a larger batch are on the device.
     """
-    from caper_jax import categories
+    from caper_jax.cli.common import chosen_categories
 
-    for name in arguments.category or (
-        categories.names() if arguments.preset == "fast" else ["laptop"]
-    ):
+    given = arguments.category or ([] if arguments.preset == "fast" else ["laptop"])
+    for name in chosen_categories(given):
         for batch in arguments.batch or ((1, 32) if arguments.preset == "fast" else (1,)):
             measure = _fast if arguments.preset == "fast" else _paper
             found = measure(name, batch, arguments.repeats, arguments.bfloat16)

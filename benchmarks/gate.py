@@ -1,4 +1,4 @@
-"""``caper benchmark gate``: has a change made anything slower?
+"""``bin/benchmark gate``: has a change made anything slower?
 
 Each ratio is the time of a plain computation over the time of ours, measured in turn in one
 process, so that what else the machine does cancels. Between kinds of processors it does not: one
@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import timing
+from benchmarks.arguments import positive_int
 from caper_jax import machine
-from caper_jax.cli import common
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
 
@@ -30,7 +30,7 @@ _TWISTS = 200_000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=15, help="runs (default: %(default)s)"
+        "--repeats", type=positive_int, default=15, help="runs (default: %(default)s)"
     )
     parser.add_argument(
         "--baseline", type=Path, default=BASELINE, metavar="FILE", help="(default: the committed)"

@@ -1,4 +1,4 @@
-"""``caper benchmark generator``: how fast labeled frames are drawn."""
+"""``bin/benchmark generator``: how fast labeled frames are drawn."""
 
 from __future__ import annotations
 
@@ -9,30 +9,28 @@ from functools import partial
 from typing import Any
 
 from benchmarks import costs, timing
+from benchmarks.arguments import positive_int
 from caper_jax import machine
-from caper_jax.cli import common
+from caper_jax.cli.common import chosen_categories
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--category", action="append", help="may be repeated (default: all)")
+    parser.add_argument(
+        "--category",
+        action="append",
+        help="may be repeated, listed with commas, or all (default: all)",
+    )
     parser.add_argument(
         "--grid",
         action="append",
-        type=common.positive_int,
+        type=positive_int,
         help="rays per side, may be repeated (default: 96 and 128)",
     )
     parser.add_argument(
-        "--batch", type=common.positive_int, default=24, help="frames (default: %(default)s)"
+        "--batch", type=positive_int, default=24, help="frames (default: %(default)s)"
     )
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=30, help="batches (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="another value of the [data] section, e.g. table=0.5, may be repeated",
+        "--repeats", type=positive_int, default=30, help="batches (default: %(default)s)"
     )
 
 
@@ -45,10 +43,10 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     from caper_jax.synthetic.frames import Generator
 
     keys = [jax.random.key(index) for index in range(arguments.repeats)]
-    chosen = [categories.get(name) for name in arguments.category or categories.names()]
+    chosen = map(categories.get, chosen_categories(arguments.category or ()))
     for category in chosen:
         for grid in arguments.grid or (96, 128):
-            config = override(GeneratorConfig(instances=200, grid=grid), *arguments.set)
+            config = override(GeneratorConfig(instances=200, grid=grid), *arguments.settings)
             generator = Generator(category, config)
             began = time.perf_counter()
             draw = jax.jit(generator.draw, static_argnames="batch_size")

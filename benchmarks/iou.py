@@ -1,4 +1,4 @@
-"""``caper benchmark iou``: exact intersection over union of oriented boxes."""
+"""``bin/benchmark iou``: exact intersection over union of oriented boxes."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from benchmarks import timing
+from benchmarks.arguments import positive_int
 from caper_jax import machine
-from caper_jax.cli import common
 
 TARGET = 20_000  # pairs per second on two CPU cores
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--pairs", type=common.positive_int, default=4096, help="at once (default: %(default)s)"
+        "--pairs", type=positive_int, default=4096, help="at once (default: %(default)s)"
     )
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=10, help="runs (default: %(default)s)"
+        "--repeats", type=positive_int, default=10, help="runs (default: %(default)s)"
     )
 
 

@@ -1,4 +1,4 @@
-"""``caper benchmark loader``: what feeding from disk costs a training step."""
+"""``bin/benchmark loader``: what feeding from disk costs a training step."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from caper_jax.cli import common
+from benchmarks.arguments import positive_int
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", default="caper", help="layout of --data (default: caper)")
     parser.add_argument("--split", help="(default: all there is)")
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=100, help="steps (default: %(default)s)"
+        "--repeats", type=positive_int, default=100, help="steps (default: %(default)s)"
     )
 
 

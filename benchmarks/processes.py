@@ -1,4 +1,4 @@
-"""``caper benchmark processes``: what data parallelism costs, measured here or on paper."""
+"""``bin/benchmark processes``: what data parallelism costs, measured here or on paper."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks import cost_model
+from benchmarks.arguments import positive_int
 from benchmarks.training import TARGETS
 from benchmarks.worker import Job
 from caper_jax import machine
-from caper_jax.cli import common
 from caper_jax.errors import CaperError
 
 if TYPE_CHECKING:
@@ -37,11 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--batch",
-        type=common.positive_int,
+        type=positive_int,
         help="samples per step and process or device (default: the preset's)",
     )
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=10, help="steps (default: %(default)s)"
+        "--repeats", type=positive_int, default=10, help="steps (default: %(default)s)"
     )
     cost_model.add_arguments(parser.add_argument_group("on paper"))
 

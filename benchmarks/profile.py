@@ -1,4 +1,4 @@
-"""``caper benchmark profile``: what takes the time in one estimate and in one step of tracking."""
+"""``bin/benchmark profile``: what takes the time in one estimate and in one step of tracking."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import timing
+from benchmarks.arguments import positive_int
 from caper_jax import machine
-from caper_jax.cli import common
+from caper_jax.cli.common import check_folder
 from caper_jax.config import RefinerConfig
 
 _POINTS = 3000  # of a cloud as it comes from a camera
@@ -35,14 +36,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--category", default="laptop", help="(default: %(default)s)")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the rows there (PNG)")
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=50, help="runs (default: %(default)s)"
+        "--repeats", type=positive_int, default=50, help="runs (default: %(default)s)"
     )
 
 
 def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Parts of the chain compiled apart and timed in turn; the rest is what remains."""
     if arguments.plot is not None:
-        common.check_folder(arguments.plot.parent, "--plot")
+        check_folder(arguments.plot.parent, "--plot")
     estimator, estimator_calls, tracker_calls = _calls(arguments.category)
     rows = []
     for chain, parts, calls in (

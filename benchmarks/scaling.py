@@ -1,4 +1,4 @@
-"""``caper benchmark scaling``: time and memory as points, parts and batch grow."""
+"""``bin/benchmark scaling``: time and memory as points, parts and batch grow."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import timing
+from benchmarks.arguments import positive_int
 from caper_jax import machine
-from caper_jax.cli import common
+from caper_jax.cli.common import check_folder
 
 SIZES = {
     "points": (256, 512, 1024, 2048, 4096, 8192, 16384),
@@ -25,14 +26,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the rows there (PNG)")
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=5, help="runs (default: %(default)s)"
+        "--repeats", type=positive_int, default=5, help="runs (default: %(default)s)"
     )
 
 
 def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """The estimator with random weights; 1,024 points, 2 parts and batch 1 where not said."""
     if arguments.plot is not None:
-        common.check_folder(arguments.plot.parent, "--plot")
+        check_folder(arguments.plot.parent, "--plot")
     rows = []
     for varied in arguments.vary or SIZES:
         for size in SIZES[varied]:

@@ -1,4 +1,4 @@
-"""``caper benchmark se3``: exponentials and logarithms of many twists, beside jaxlie's."""
+"""``bin/benchmark se3``: exponentials and logarithms of many twists, beside jaxlie's."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from functools import partial
 from typing import Any
 
 from benchmarks import timing
+from benchmarks.arguments import positive_int
 from caper_jax import machine
-from caper_jax.cli import common
 
 # How many times as fast as jaxlie.
 TARGETS = {"exp": 1.5, "log": 3.0, "exp+log, gradient": 1.5}
@@ -19,10 +19,10 @@ _CHECKED = 20_000  # twists that errors are taken over
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--twists", type=common.positive_int, default=1_000_000, help="(default: %(default)s)"
+        "--twists", type=positive_int, default=1_000_000, help="(default: %(default)s)"
     )
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=10, help="runs (default: %(default)s)"
+        "--repeats", type=positive_int, default=10, help="runs (default: %(default)s)"
     )
 
 

@@ -1,4 +1,4 @@
-"""``caper benchmark start``: what one waits for before the first pose, in fresh processes."""
+"""``bin/benchmark start``: what one waits for before the first pose, in fresh processes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from benchmarks.arguments import positive_int
 from caper_jax import machine
-from caper_jax.cli import cache, common
 from caper_jax.errors import CaperError
 
 _IMPORT = """
@@ -28,8 +28,8 @@ print(time.perf_counter() - began)
 _FIRST_POSE = """
 import numpy as np
 import caper_jax
-from caper_jax.cli import cache
-cache.enable()
+from caper_jax.machine import keep_programs
+keep_programs()
 points = np.random.default_rng(0).uniform(-0.1, 0.1, (1500, 3)) + [0.0, 0.0, 0.8]
 estimator = caper_jax.load("laptop")
 print(np.asarray(estimator(points.astype(np.float32)).pose.rotation).shape)
@@ -38,18 +38,18 @@ print(np.asarray(estimator(points.astype(np.float32)).pose.rotation).shape)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=3, help="processes (default: %(default)s)"
+        "--repeats", type=positive_int, default=3, help="processes (default: %(default)s)"
     )
 
 
 def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Whole processes, from the start of Python to its end; the import beyond jax and flax."""
-    switched_off = {cache.SWITCH: "off"}
+    switched_off = {machine.SWITCH: "off"}
     imports = [float(_run(_IMPORT, switched_off)[1]) for _ in range(arguments.repeats)]
     bare = [_run("import jax, flax", switched_off)[0] for _ in range(arguments.repeats)]
     cold = [_run(_FIRST_POSE, switched_off)[0] for _ in range(arguments.repeats)]
     with tempfile.TemporaryDirectory() as folder:
-        kept = {cache.SWITCH: "on", "XDG_CACHE_HOME": folder}
+        kept = {machine.SWITCH: "on", "XDG_CACHE_HOME": folder}
         _run(_FIRST_POSE, kept)
         warm = [_run(_FIRST_POSE, kept)[0] for _ in range(arguments.repeats)]
     reference = statistics.median(bare)

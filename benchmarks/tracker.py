@@ -1,4 +1,4 @@
-"""``caper benchmark tracker``: one step of the tracker against one estimate, or of many at once."""
+"""``bin/benchmark tracker``: one step of the tracker against one estimate, or of many at once."""
 
 from __future__ import annotations
 
@@ -10,25 +10,30 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import costs, timing
+from benchmarks.arguments import positive_int
 from caper_jax import machine
-from caper_jax.cli import common
+from caper_jax.cli.common import chosen_categories
 
 _VIDEOS = 2  # that the frames come from, one video at a time
 _DISTINCT = 4  # of many at once; the rest repeats them
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--category", action="append", help="may be repeated (default: laptop)")
+    parser.add_argument(
+        "--category",
+        action="append",
+        help="may be repeated, listed with commas, or all (default: laptop)",
+    )
     parser.add_argument("--weights", type=Path, help="model directory (default: the package's)")
     parser.add_argument(
         "--videos",
-        type=common.positive_int,
+        type=positive_int,
         default=1,
         help="tracked at once, by one program on the device (default: %(default)s)",
     )
     parser.add_argument(
         "--repeats",
-        type=common.positive_int,
+        type=positive_int,
         default=10,
         help="passes over the frames (default: %(default)s)",
     )
@@ -40,7 +45,7 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     Many: the step alone, vmapped, from points on the device to poses there. No video may ask the
     estimator alone then: all are estimated in every frame, and the answer kept where it is due.
     """
-    for name in arguments.category or ["laptop"]:
+    for name in chosen_categories(arguments.category or ["laptop"]):
         if arguments.videos == 1:
             yield _measure(name, arguments.weights, arguments.repeats)
         else:

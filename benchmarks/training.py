@@ -1,4 +1,4 @@
-"""``caper benchmark training``: steps of both stages on generated frames, and their memory."""
+"""``bin/benchmark training``: steps of both stages on generated frames, and their memory."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from benchmarks import costs, timing
+from benchmarks.arguments import positive_int
 from caper_jax import machine
-from caper_jax.cli import common
 
 if TYPE_CHECKING:
     from caper_jax.config import BatchNormExtent
@@ -25,18 +25,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--batch",
         action="append",
-        type=common.positive_int,
+        type=positive_int,
         help="samples per step, may be repeated (default: the preset's; of paper 2, 4 and 16)",
     )
     parser.add_argument(
         "--steps-per-dispatch",
-        type=common.positive_int,
+        type=positive_int,
         default=1,
         metavar="N",
         help="steps compiled into one call, to hide the cost of calling (default: %(default)s)",
     )
     parser.add_argument(
-        "--repeats", type=common.positive_int, default=10, help="calls (default: %(default)s)"
+        "--repeats", type=positive_int, default=10, help="calls (default: %(default)s)"
     )
 
 

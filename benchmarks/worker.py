@@ -1,4 +1,4 @@
-"""One process of ``caper benchmark processes``: joins the others, trains, prints what it took."""
+"""One process of ``bin/benchmark processes``: joins the others, trains, prints what it took."""
 
 from __future__ import annotations
 
@@ -100,9 +100,9 @@ def main(text: str) -> None:
     os.sched_setaffinity(0, {job.core})
     import jax
 
-    from caper_jax.cli import cache
+    from caper_jax.machine import keep_programs
 
-    cache.enable()
+    keep_programs()
     print(json.dumps(perform(job)))
     if job.processes > 1:
         jax.distributed.shutdown()

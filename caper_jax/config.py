@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import tomllib
 import types
 import typing
@@ -22,7 +21,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import jax
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 
-from caper_jax.errors import CaperError, unknown_name
+from caper_jax.errors import CaperError, describe_problem, unknown_name
 
 T = TypeVar("T")
 Count = Annotated[int, Ge(1)]
@@ -630,41 +629,27 @@ def preset(name: str, category: str = "") -> RunConfig:
 # ------------------------------------------------------------------------ reading and writing
 
 
-def load(path: str | Path, cls: type[T], *overrides: str) -> T:
-    """Read a configuration.
-
-    Args:
-      path: TOML file.
-      cls: a section.
-      *overrides: "section.key=value", applied before the values are validated together.
-
-    Raises:
-      CaperError: the file cannot be read, or holds an unknown key or a wrong value.
-    """
-    values = _read_toml(path)
-    for assignment in overrides:
-        _assign(values, cls, assignment)
-    return from_dict(cls, values, str(path))
-
-
 def override(config: T, *assignments: str) -> T:
-    """A copy of a configuration with some values replaced.
+    """A copy of a configuration with some values replaced, all checked together.
 
     Args:
       config: a section.
-      *assignments: "section.key=value"; the value in TOML, where strings need no quotes and
-        ``none`` stands for None.
+      *assignments: "section.key=value"; the value in TOML, where strings need no quotes, lists no
+        brackets, and ``none`` stands for None.
 
     Example:
-      override(config, "training.learning_rate=1e-3", "training.optimizer=adamw")
+      override(config, "training.learning_rate=1e-3", "data.noise=none,kinect")
 
     Raises:
       CaperError: no such key, or a value of the wrong type or out of range.
     """
     values = to_dict(config)
     for assignment in assignments:
-        _assign(values, type(config), assignment)
-    return from_dict(type(config), values, "override")
+        key, equals, text = (part.strip() for part in assignment.partition("="))
+        if not key or not equals:
+            raise CaperError(f"setting {assignment!r}: write section.key=value")
+        _assign(values, type(config), key, text)
+    return from_dict(type(config), values)
 
 
 def update(config: T, path: str | Path) -> T:
@@ -674,7 +659,12 @@ def update(config: T, path: str | Path) -> T:
       CaperError: the file cannot be read, or holds an unknown key or a wrong value.
     """
     values = to_dict(config)
-    _merge(values, _read_toml(path), type(config))
+    try:
+        _merge(values, tomllib.loads(Path(path).read_text(encoding="utf-8")), type(config))
+    except OSError as error:
+        raise CaperError(f"cannot read configuration {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CaperError(f"{path} is not valid TOML: {error}") from error
     return from_dict(type(config), values, str(path))
 
 
@@ -687,7 +677,7 @@ def check(config: T) -> T:
     return from_dict(type(config), to_dict(config), type(config).__name__)
 
 
-def from_dict(cls: type[T], values: dict[str, Any], where: str) -> T:
+def from_dict(cls: type[T], values: dict[str, Any], where: str = "") -> T:
     """A section from nested dicts of plain values.
 
     Args:
@@ -704,39 +694,21 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str) -> T:
         # As JSON: there, and only there, strict validation takes lists for tuples.
         return TypeAdapter(cls).validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
-        raise CaperError(f"{where}: {_first_problem(cls, error.errors()[0])}") from error
-    except CaperError as error:
-        raise CaperError(f"{where}: {error}") from error
-    except TypeError as error:  # a TOML date, say
-        raise CaperError(f"{where}: {error}") from error
+        problem = _first_problem(cls, error)
+    except (CaperError, TypeError) as error:  # of a section, or a TOML date, which JSON lacks
+        problem = str(error)
+    raise CaperError(f"{where}: {problem}" if where else problem)
 
 
-def _first_problem(cls: type, problem: Any) -> str:
-    """What pydantic found first, in one line that names the field."""
-    parents = problem["loc"][:-1]
-    key = ".".join(map(str, problem["loc"])) or "the configuration"
-    if problem["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-        known = _fields_at(cls, parents)
-        prefix = "".join(f"{parent}." for parent in parents)
-        return str(unknown_name("key", key, (prefix + name for name in known)))
-    if problem["type"] == "missing":
-        return f"{key} is missing"
-    if problem["type"] == "literal_error" and isinstance(problem["input"], str):
-        names = problem["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", ")
-        return str(unknown_name(key, problem["input"], names))
-    message = (
-        problem["msg"]
-        .replace("Input should be", "must be")
-        .replace("greater than or equal to", "at least")
-        .replace("Value error, ", "")
-    )
-    return f"{key} {message}, got {problem['input']!r}"
-
-
-def _fields_at(cls: type, parents: Sequence[Any]) -> list[str]:
+def _first_problem(cls: type, error: Any) -> str:
+    """What pydantic found first; an unknown key with those of its section."""
+    problem = error.errors()[0]
+    if problem["type"] not in ("unexpected_keyword_argument", "extra_forbidden"):
+        return describe_problem(error)
+    *parents, name = map(str, problem["loc"])
     for parent in parents:
-        cls = _without_none(typing.get_type_hints(cls)[str(parent)])
-    return [f.name for f in dataclasses.fields(cls)]
+        cls = _field_types(cls)[parent]
+    return str(_unknown_key(parents, name, cls))
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -744,24 +716,53 @@ def to_dict(config: Any) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
-def to_toml(config: Any) -> str:
-    """The configuration as TOML that ``load`` reads back to an equal one.
-
-    Raises:
-      CaperError: a field is None where its default is not, which TOML cannot express.
-    """
-    return "\n".join(_toml_lines(config, "")).strip() + "\n"
-
-
 def _merge(values: dict[str, Any], changes: dict[str, Any], cls: type) -> None:
-    kinds = typing.get_type_hints(cls)
+    """Puts nested changes into nested values; what does not fit is left to ``from_dict``."""
     for key in changes:
         _unset_alternatives(values, cls, key)
     for key, change in changes.items():
         if isinstance(change, dict) and isinstance(values.get(key), dict):
-            _merge(values[key], change, _without_none(kinds[key]))
+            _merge(values[key], change, _field_types(cls)[key])
         else:
             values[key] = change
+
+
+def _assign(values: dict[str, Any], cls: type, key: str, text: str) -> None:
+    """Puts the value of "a.b" into nested dicts, typed by the section."""
+    *parents, name = key.split(".")
+    for depth, parent in enumerate(parents):
+        types_ = _field_types(cls)
+        if parent not in types_:
+            raise _unknown_key(parents[:depth], parent, cls)
+        cls = types_[parent]
+        if not dataclasses.is_dataclass(cls):
+            raise CaperError(f"{'.'.join(parents[: depth + 1])} is not a section")
+        if values.get(parent, {}) is None:
+            raise CaperError(f"{key}: this configuration has no {parent}")
+        values = values.setdefault(parent, {})
+    if name not in _field_types(cls):
+        raise _unknown_key(parents, name, cls)
+    kind = typing.get_type_hints(cls)[name]
+    if type(None) in typing.get_args(kind) and text.lower() == "none":
+        values[name] = None
+        return
+    if dataclasses.is_dataclass(_field_types(cls)[name]):
+        raise CaperError(f"{key} is a section; name a key in it")
+    values[name] = _value(text, _field_types(cls)[name])
+    _unset_alternatives(values, cls, name)
+
+
+def _value(text: str, kind: Any) -> Any:
+    """A setting's text as a plain value; whether it fits the field is checked with all others."""
+    if typing.get_origin(kind) is tuple and not text.startswith("["):
+        item = typing.get_args(kind)[0]
+        return [_value(part.strip(), item) for part in text.split(",")]
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text  # a string without quotes, or a mistake that the check names
+    # A name may read as a number, a date or a boolean.
+    return text if kind is str and not isinstance(value, str) else value
 
 
 def _unset_alternatives(values: dict[str, Any], cls: type, key: str) -> None:
@@ -771,6 +772,12 @@ def _unset_alternatives(values: dict[str, Any], cls: type, key: str) -> None:
         values.update((other, None) for other in alternatives if other != key)
 
 
+def _field_types(cls: type) -> dict[str, Any]:
+    """Field -> type, without ``| None``."""
+    hints = typing.get_type_hints(cls)
+    return {field.name: _without_none(hints[field.name]) for field in dataclasses.fields(cls)}
+
+
 def _without_none(kind: Any) -> Any:
     """``T`` of ``T | None``, other types as they are."""
     inner = [a for a in typing.get_args(kind) if a is not type(None)]
@@ -778,76 +785,6 @@ def _without_none(kind: Any) -> Any:
     return inner[0] if optional and len(inner) == 1 else kind
 
 
-def _read_toml(path: str | Path) -> dict[str, Any]:
-    try:
-        with open(path, "rb") as file:
-            return tomllib.load(file)
-    except OSError as error:
-        raise CaperError(f"cannot read configuration {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CaperError(f"{path} is not valid TOML: {error}") from error
-
-
-def _assign(values: dict[str, Any], cls: type, assignment: str) -> None:
-    """Put the value of "a.b=value" into nested dicts, typed by the section."""
-    key, equals, text = assignment.partition("=")
-    key, text = key.strip(), text.strip()
-    where = f"override {assignment!r}"
-    if not equals or not key:
-        raise CaperError(f"{where}: write section.key=value")
-    *sections, name = key.split(".")
-    prefix = ""
-    for part in sections:
-        cls = _without_none(_field_type(cls, part, prefix, where))
-        prefix += part + "."
-        if not dataclasses.is_dataclass(cls):
-            raise CaperError(f"{where}: {prefix[:-1]} is not a section")
-        if values.get(part, {}) is None:
-            raise CaperError(f"{where}: there is no {prefix[:-1]} in this run")
-        values = values.setdefault(part, {})
-    kind = _field_type(cls, name, prefix, where)
-    optional = type(None) in typing.get_args(kind)
-    if dataclasses.is_dataclass(_without_none(kind)) and not (optional and text.lower() == "none"):
-        raise CaperError(f"{where}: {key} is a section; name a key in it")
-    try:
-        values[name] = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        values[name] = text  # a string without quotes, or a mistake that the type check names
-    if optional and text.lower() == "none":
-        values[name] = None
-    elif not isinstance(values[name], str) and _without_none(kind) is str:
-        values[name] = text  # a name that happens to read as a number, date or boolean
-    if values[name] is not None:
-        _unset_alternatives(values, cls, name)
-
-
-def _field_type(cls: type, name: str, prefix: str, where: str) -> Any:
-    names = {f.name for f in dataclasses.fields(cls)}
-    if name not in names:
-        raise CaperError(
-            f"{where}: {unknown_name('key', prefix + name, (prefix + n for n in names))}"
-        )
-    return typing.get_type_hints(cls)[name]
-
-
-def _toml_lines(config: Any, prefix: str) -> list[str]:
-    """Keys first, then one table per nested section."""
-    lines, sections = [], []
-    for f in dataclasses.fields(config):
-        value, key = getattr(config, f.name), prefix + f.name
-        if dataclasses.is_dataclass(value):
-            sections += ["", f"[{key}]", *_toml_lines(value, key + ".")]
-        elif value is not None:
-            lines.append(f"{f.name} = {_toml_value(value)}")
-        elif f.default is not None:
-            raise CaperError(f"{key} is None, which TOML cannot express; its default is not None")
-    return lines + sections
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, tuple | list):
-        return f"[{', '.join(map(_toml_value, value))}]"
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)  # "inf", "-inf", "nan"
-    # JSON's strings and booleans are TOML's, but for DEL.
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+def _unknown_key(parents: Sequence[str], name: str, cls: type) -> CaperError:
+    prefix = "".join(f"{parent}." for parent in parents)
+    return unknown_name("key", prefix + name, (prefix + known for known in _field_types(cls)))

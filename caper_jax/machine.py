@@ -1,12 +1,20 @@
-"""What a measured time depends on."""
+"""This machine: what measured times depend on, and where compiled programs are kept."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
+import sys
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from caper_jax.cli.cache import cpu_fact
+SWITCH = "CAPER_CACHE"  # environment variable; "off" compiles every time
+MAX_BYTES = 512 * 1024**2
+# Below this (seconds) compiling again is as fast as looking it up.
+_WORTH_KEEPING = 0.1
 
 
 def machine() -> dict[str, Any]:
@@ -26,9 +34,87 @@ def machine() -> dict[str, Any]:
 
 def processor() -> str:
     """What kind of processor this is, as the system calls it."""
-    return cpu_fact("model name") or platform.processor() or platform.machine()
+    return _cpu_fact("model name") or platform.processor() or platform.machine()
 
 
 def load_average() -> float:
     """Processes that wanted to run, mean over the last minute."""
     return round(os.getloadavg()[0], 2)
+
+
+def keep_programs(environment: Mapping[str, str] = os.environ) -> Path | None:
+    """Makes JAX keep what it compiles in this process, and use what others have kept.
+
+    Does nothing where the user has told JAX itself (``JAX_COMPILATION_CACHE_DIR``), has switched
+    it off (``CAPER_CACHE=off``), or has no folder that can be written in. JAX's own bound on the
+    size needs another package and a lock at every look-up, for which commands that run side by
+    side would wait; here a command that starts removes what has not been used for longest.
+
+    Returns:
+      The folder, or None.
+    """
+    if environment.get(SWITCH, "").lower() in ("off", "0", "no", "false"):
+        return None
+    parent = user_folder(environment)
+    if parent is None or "JAX_COMPILATION_CACHE_DIR" in environment:
+        return None
+    # By kind of processor: machine code for another one, in a shared home, would crash.
+    facts = platform.machine() + platform.processor() + _cpu_fact("flags", "Features")
+    folder = parent / "caper_jax" / hashlib.sha256(facts.encode()).hexdigest()[:12]
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError:
+        return None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        return None
+    trim(folder, MAX_BYTES)
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in environment:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
+    # A full disk or a damaged entry costs time, nothing else.
+    warnings.filterwarnings("ignore", message=".*persistent compilation cache", append=True)
+    return folder
+
+
+def user_folder(environment: Mapping[str, str], system: str = sys.platform) -> Path | None:
+    """Where this system's programs keep what can be made again; None for a user without home."""
+    if given := environment.get("XDG_CACHE_HOME"):
+        return Path(given) if Path(given).is_absolute() else None
+    if system == "win32" and (given := environment.get("LOCALAPPDATA")):
+        return Path(given)
+    try:
+        home = Path(environment["HOME"]) if "HOME" in environment else Path.home()
+    except RuntimeError:
+        return None
+    # A home that does not exist is not ours to make.
+    if not home.is_dir():
+        return None
+    return home / ("Library/Caches" if system == "darwin" else ".cache")
+
+
+def trim(folder: Path, max_bytes: int) -> None:
+    """Removes the files of a folder that have not been used for longest, down to a size."""
+    files = []
+    try:
+        for entry in os.scandir(folder):
+            facts = entry.stat()
+            files.append((max(facts.st_atime, facts.st_mtime), facts.st_size, entry.path))
+        excess = sum(size for _, size, _ in files) - max_bytes
+        for _, size, path in sorted(files):
+            if excess <= 0:
+                return
+            os.unlink(path)
+            excess -= size
+    except OSError:  # another command removes the same, or it is not ours: another time
+        return
+
+
+def _cpu_fact(*names: str) -> str:
+    """What Linux says of the processor under the first of these names it has, else ""."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return ""
+    return next((line.split(":", 1)[-1].strip() for line in lines if line.startswith(names)), "")

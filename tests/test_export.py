@@ -232,7 +232,7 @@ def test_mistakes_are_one_line_and_code_2(drawer, tmp_path, capsys):
     for arguments, message in (
         (["--category", "teapot", *out], "unknown category 'teapot'"),
         (["--category", "box", "--out", str(tmp_path / "file")], "is a file; give a folder"),
-        (["--category", "box", *out, "--batch", "0"], "'0' is not a whole number above 0"),
+        (["--category", "box", *out, "--batch", "0"], "'0' is neither any nor a number"),
         ([*own, *out, "--platform", "gpu"], "unknown platform 'gpu'"),
         (["--category", "box", "--weights", str(tmp_path), *out], "it has no model.json"),
     ):

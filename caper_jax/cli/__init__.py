@@ -7,8 +7,9 @@ import sys
 from collections.abc import Sequence
 
 from caper_jax._version import __version__
-from caper_jax.cli import cache, common
+from caper_jax.cli import common
 from caper_jax.errors import unknown_name
+from caper_jax.machine import keep_programs
 
 # Command -> one line for --help; the module of the same name holds it, imported only when it runs.
 COMMANDS = {
@@ -25,23 +26,19 @@ COMMANDS = {
     "reproduce": "measure the tables of the paper again",
 }
 
-EXAMPLES = """\
-examples:
-  caper demo                        pictures and a page in outputs/demo
-  caper train --help                options and examples of one command
-"""
-
 
 def help_text() -> str:
     """What ``caper --help`` prints."""
     width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items()]
+    lines = [f"  {name:<{width}}  {summary}\n" for name, summary in COMMANDS.items()]
     return (
         "usage: caper <command> [options]\n\n"
         "Poses of articulated objects (boxes, laptops, ...) from a single depth image.\n\n"
-        "commands:\n" + "\n".join(lines) + "\n\noptions:\n"
+        f"commands:\n{''.join(lines)}\noptions:\n"
         "  -h, --help  show this text\n"
-        "  --version   show the version\n\n" + EXAMPLES
+        "  --version   show the version\n\nexamples:\n"
+        "  caper demo                        pictures and a page in outputs/demo\n"
+        "  caper train --help                options and examples of one command\n"
     )
 
 
@@ -63,8 +60,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return common.EXIT_USAGE
 
     def start(command_argv: Sequence[str]) -> int:
-        cache.enable()
         # Imported inside run, so that Ctrl-C during a slow import is reported like any other.
-        return importlib.import_module(f"caper_jax.cli.{command}").main(command_argv)
+        module = importlib.import_module(f"caper_jax.cli.{command}")
+        options = module.parse(command_argv)  # help and mistakes come before JAX is imported
+        keep_programs()
+        return module.run(options)
 
     return common.run(start, rest, command=command)

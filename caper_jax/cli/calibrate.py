@@ -2,69 +2,69 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from caper_jax.cli import common
+from caper_jax.cli.common import Count, Size
+from caper_jax.errors import CaperError
+
+EXAMPLES = (
+    ("--category box --weights runs/box", "a model trained on data of your own"),
+    ("--category box --weights runs/box --refiner", "and its refiner"),
+)
 
 
-def build_parser() -> argparse.ArgumentParser:
-    parser = common.create_parser(
-        "calibrate",
-        "Fits what a model says about its own errors (rotation_std, translation_std, state_std)\n"
-        "on generated frames of instances that training never shows, and writes it into the\n"
-        "model's card; with --sides first the network that corrects its estimates by the sides of\n"
-        "their boxes. Training on generated frames does both at its end.",
-        [
-            ("--category box --weights runs/box", "a model trained on data of your own"),
-            ("--category box --weights runs/box --sides", "and its sides"),
-        ],
-    )
-    parser.add_argument("--category", required=True, help="e.g. box, or FILE.py:NAME")
-    parser.add_argument(
-        "--weights", required=True, type=Path, help="model directory; its model.json is rewritten"
-    )
-    parser.add_argument(
-        "--frames", type=common.positive_int, help="to fit on (default: 4096)", metavar="N"
-    )
-    parser.add_argument(
-        "--sides",
-        type=common.positive_int,
-        nargs="?",
-        const=True,
-        metavar="N",
-        help="fit the sides first, on N frames (default: 40000)",
-    )
-    parser.add_argument(
-        "--seed",
-        type=common.non_negative_int,
-        default=0,
-        help="of shapes and frames (default: %(default)s)",
-    )
-    return parser
+@dataclass(frozen=True)
+class Calibrate:
+    """Fits what a model says about its own errors, and writes it into the model's card.
+
+    These standard deviations (rotation_std, translation_std, state_std) are fitted on generated
+    frames of instances that training never shows. With --refiner the network that corrects the
+    model's estimates by the sides of their boxes is fitted first. Training on generated frames
+    does both at its end.
+
+    Attributes:
+      category: e.g. box, or FILE.py:NAME for one of your own
+      weights: model directory; its model.json is rewritten
+      frames: to calibrate on
+      refiner: fit the refiner first
+      refiner_frames: to fit the refiner on
+      seed: of shapes and frames
+    """
+
+    category: str
+    weights: Path
+    frames: Count = 4096
+    refiner: bool = False
+    refiner_frames: Count = 40_000
+    seed: Size = 0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def parse(argv: Sequence[str]) -> Calibrate:
+    options = common.parse(Calibrate, argv, EXAMPLES)
+    if options.refiner_frames != Calibrate.refiner_frames and not options.refiner:
+        raise CaperError("--refiner-frames goes with --refiner")
+    return options
+
+
+def run(options: Calibrate) -> int:
     """Runs the command; returns its exit code."""
-    arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
     from caper_jax.config import TRAINING_DATA
     from caper_jax.estimator import load
     from caper_jax.models.files import CARD_FILE, write_card
-    from caper_jax.training.fit_uncertainty import FRAMES, calibrate, check_frame_count
+    from caper_jax.training import fit_refiner
+    from caper_jax.training.fit_uncertainty import calibrate, check_frame_count
 
-    frames = arguments.frames or FRAMES
-    check_frame_count(frames)  # before anything is written
-    if arguments.sides:
-        from caper_jax.config import RefinerConfig
-        from caper_jax.training import fit_refiner
-
-        number = RefinerConfig().frames if arguments.sides is True else arguments.sides
-        options = {"frames": number, "seed": arguments.seed}
-        fit_refiner.add_sides(arguments.weights, arguments.category, TRAINING_DATA, **options)
-    estimator = load(arguments.category, arguments.weights)
-    section = calibrate(estimator, TRAINING_DATA, frames, arguments.seed)
-    write_card(arguments.weights, {**estimator.card, "calibration": section})
-    print(f"written: {arguments.weights / CARD_FILE} (calibrated on {frames} frames)")
+    weights, category = options.weights, options.category
+    check_frame_count(options.frames)  # before anything is written
+    if options.refiner:
+        fit_refiner.add_sides(
+            weights, category, TRAINING_DATA, frames=options.refiner_frames, seed=options.seed
+        )
+    estimator = load(category, weights)
+    section = calibrate(estimator, TRAINING_DATA, options.frames, options.seed)
+    write_card(weights, {**estimator.card, "calibration": section})
+    print(f"written: {weights / CARD_FILE} (calibrated on {options.frames} frames)")
     return 0

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from statistics import median
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from caper_jax.cli import common
-from caper_jax.errors import CaperError
+from caper_jax.errors import CaperError, unknown_name
 
 if TYPE_CHECKING:
     from caper_jax.articulation.category import Category
@@ -22,46 +21,51 @@ if TYPE_CHECKING:
     from caper_jax.estimator import Prediction
     from caper_jax.visualization.scene import Scene
 
+EXAMPLES = (
+    ("", "all categories"),
+    ("--category box", "one category"),
+    ("--out /tmp/demo", "another folder than outputs/demo"),
+)
 TIMED_CALLS = 10  # per frame, after the first
 
 
-def build_parser() -> argparse.ArgumentParser:
-    parser = common.create_parser(
-        "demo",
-        "Estimates the objects in the depth frames that ship with the package, compares\n"
-        "them with the ground truth, and draws them: a picture per category, and one page\n"
-        "to turn in a browser.",
-        [
-            ("", "all categories"),
-            ("--category box", "one category"),
-            ("--out /tmp/demo", "another folder than outputs/demo"),
-        ],
-    )
-    parser.add_argument(
-        "--out", type=Path, default=Path("outputs/demo"), help="folder (default: %(default)s)"
-    )
-    parser.add_argument("--category", default="all", help="a category's name (default: all)")
-    return parser
+@dataclass(frozen=True)
+class Demo:
+    """Estimates the objects in the depth frames that ship with the package.
+
+    Compares them with the ground truth, and draws them: a picture per category, and one page to
+    turn in a browser.
+
+    Attributes:
+      category: a name, several with commas, or all
+      out: folder for pictures and page
+    """
+
+    category: tuple[str, ...] = ()
+    out: Path = Path("outputs/demo")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def parse(argv: Sequence[str]) -> Demo:
+    options = common.parse(Demo, argv, EXAMPLES)
+    common.check_folder(options.out, "--out")
+    _find_frames(options.category)
+    return options
+
+
+def run(options: Demo) -> int:
     """Runs the command; returns its exit code."""
-    arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
-    frames = _find_frames(arguments.category)
-    common.check_folder(arguments.out, "--out")
-
     from caper_jax import categories
     from caper_jax.visualization.page import write_page
     from caper_jax.visualization.picture import write_picture
 
     scenes: list[Scene] = []
     written = []
-    for name, folders in frames.items():
+    for name, folders in _find_frames(options.category).items():
         category = categories.get(name)
         own = _run_category(category, folders)
-        written.append(write_picture(arguments.out / f"{name}.png", own))
+        written.append(write_picture(options.out / f"{name}.png", own))
         scenes += own
-    page = write_page(arguments.out / "index.html", scenes, "Estimated poses")
+    page = write_page(options.out / "index.html", scenes, "Estimated poses")
     print("pictures:", ", ".join(str(path) for path in written))
     print(f"page:     {page} (open it in a browser: turn the objects, move their joints)")
     return 0
@@ -79,24 +83,22 @@ def demo_folder() -> Path:
     return Path(str(resources.files("caper_jax"))) / "assets" / "demo"
 
 
-def _find_frames(category: str) -> dict[str, list[Path]]:
+def _find_frames(chosen: Sequence[str]) -> dict[str, list[Path]]:
     """Folders of the frames to run, by category.
 
     Raises:
       CaperError: a category without frames, or no frames at all.
     """
-    found: dict[str, list[Path]] = {}
+    frames: dict[str, list[Path]] = {}
     for folder in sorted(demo_folder().glob("*_*")):
-        found.setdefault(folder.name.rpartition("_")[0], []).append(folder)
-    if not found:
+        frames.setdefault(folder.name.rpartition("_")[0], []).append(folder)
+    if not frames:
         raise CaperError(f"no demo frames in {demo_folder()}; install the package again")
-    if category == "all":
-        return found
-    if category not in found:
-        raise CaperError(
-            f"--category {category}: there are demo frames of {', '.join(found)} (or: all)"
-        )
-    return {category: found[category]}
+    names = common.chosen_categories(chosen, frames)
+    for name in names:
+        if name not in frames:
+            raise unknown_name("category of demo frames", name, [*frames, common.ALL])
+    return {name: frames[name] for name in names}
 
 
 def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
@@ -121,14 +123,14 @@ def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
                 first = _timed(estimator, points)[1]
                 bar.update(1)
             for _ in range(TIMED_CALLS):
-                found, spent = _timed(estimator, points)
+                prediction, spent = _timed(estimator, points)
                 seconds.append(spent)
                 bar.update(1)
             truth = _read_truth(folder / "truth.json", category)
             name = folder.name.replace("_", " ")
-            cloud, labels = found.points, found.labels
+            cloud, labels, pose = prediction.points, prediction.labels, prediction.pose
             scenes.append(
-                Scene(name, category, cloud, labels, found.pose, truth, depth, mask, intrinsics)
+                Scene(name, category, cloud, labels, pose, truth, depth, mask, intrinsics)
             )
     for scene in scenes:
         print(f"\n{scene.name}\n{format_scene(scene)}")

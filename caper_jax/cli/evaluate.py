@@ -2,118 +2,122 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from caper_jax.cli import common
-from caper_jax.data.readers import formats
+from caper_jax.cli.common import Count, Positive
 from caper_jax.errors import CaperError
 
 if TYPE_CHECKING:
+    from caper_jax.articulation.category import Category
     from caper_jax.data.types import Dataset
     from caper_jax.estimator import Estimator
-    from caper_jax.evaluation.protocol import Evaluation
+    from caper_jax.evaluation.protocol import Evaluation, Predictor
 
 WORST_FILE = "worst.png"
-PREDICTORS = ("model", "truth", "mean")
+EXAMPLES = (
+    ("--category box --data ReArtMix --format reartmix --out outputs/box", "real frames"),
+    ("--category box --data box_test.h5 --out outputs/box", "generated"),
+    ("--category box --data box_test.h5 --worst 6 --out outputs/box", "see why"),
+)
 
 
-def build_parser() -> argparse.ArgumentParser:
-    parser = common.create_parser(
-        "evaluate",
-        "Estimates every frame of a labeled dataset and writes to a folder: metrics.json (mean\n"
-        "and median of every error, failed frames included) and predictions.npz (every estimate).",
-        [
-            ("--category box --data ReArtMix --format reartmix --out outputs/box", "real frames"),
-            ("--category box --data box_test.h5 --out outputs/box", "generated"),
-            (
-                "--category box --data box_test.h5 --worst 6 --out outputs/box",
-                "see why",
-            ),
-        ],
-    )
-    parser.add_argument(
-        "--category", required=True, help="e.g. box, or FILE.py:NAME for one of your own"
-    )
-    parser.add_argument("--data", required=True, type=Path, help="dataset's root folder or .h5")
-    parser.add_argument(
-        "--format",
-        default="caper",
-        help=f"layout of the data: {', '.join(formats(labeled=True))} (default: caper)",
-    )
-    common.add_splits(parser)
-    parser.add_argument(
-        "--predictor",
-        default="model",
-        choices=PREDICTORS,
-        help="the model, the dataset's own truth (must score perfectly), or the mean of the "
-        "training set (what any model must beat)",
-    )
-    parser.add_argument(
-        "--weights", type=Path, help="model directory (default: the shipped one of the category)"
-    )
-    parser.add_argument(
-        "--limit", type=common.positive_int, help="at most so many frames, from the first"
-    )
-    parser.add_argument(
-        "--worst",
-        type=common.positive_int,
-        metavar="N",
-        help="also a picture of the N frames whose rotations are most off, worst.png",
-    )
-    common.add_model_options(parser)
-    parser.add_argument("--out", required=True, type=Path, help="folder for the results")
-    return parser
+@dataclass(frozen=True)
+class Evaluate:
+    """Estimates every frame of a labeled dataset and measures how far off it is.
+
+    Writes to a folder: metrics.json (mean and median of every error, failed frames included) and
+    predictions.npz (every estimate).
+
+    Attributes:
+      category: e.g. box, or FILE.py:NAME for one of your own
+      data: dataset's root folder or .h5
+      out: folder for the results
+      format: layout of the data: artimage, caper, captra, pm-videos, reart-videos or reartmix
+      split: split to read (default: all there is)
+      official_split: tell train from test by the published object ids, not by the lists of the
+        root
+      predictor: the model, the dataset's own truth (must score perfectly), or the mean of the
+        training set (what any model must beat)
+      weights: model directory (default: the shipped one of the category)
+      frames: at most so many frames, from the first (default: all)
+      worst: also a picture of so many frames whose rotations are most off, worst.png
+      object_scale: the objects are so many times as large as those the model was trained on, e.g.
+        3.7 for the laptops of PM-Videos and ArtImage (PartNet units read as meters)
+      camera_roll: degrees by which the images show things turned clockwise, 180 for upside down
+    """
+
+    category: str
+    data: Path
+    out: Path
+    format: str = "caper"
+    split: str | None = None
+    official_split: bool = False
+    predictor: Literal["model", "truth", "mean"] = "model"
+    weights: Path | None = None
+    frames: Count | None = None
+    worst: Count | None = None
+    object_scale: Positive = 1.0
+    camera_roll: float = 0.0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def parse(argv: Sequence[str]) -> Evaluate:
+    options = common.parse(Evaluate, argv, EXAMPLES)
+    if options.worst and options.predictor != "model":
+        raise CaperError("--worst shows what the model estimates; leave out --predictor")
+    common.check_folder(options.out, "--out")
+    return options
+
+
+def run(options: Evaluate) -> int:
     """Runs the command; returns its exit code."""
-    arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
     from caper_jax import categories
     from caper_jax.data.readers import open_dataset
     from caper_jax.evaluation import protocol, report
 
-    category = categories.get(arguments.category)
-    common.check_folder(arguments.out, "--out")
+    category = categories.get(options.category)
     dataset = open_dataset(
-        arguments.format,
-        arguments.data,
-        category.name,
-        arguments.split,
-        arguments.official_split,
+        options.format, options.data, category.name, options.split, options.official_split
     )
-    if arguments.worst and arguments.predictor != "model":
-        raise CaperError("--worst shows what the model finds; leave out --predictor")
-    weights = None
     predictor: protocol.Predictor = protocol.truth_predictor
-    if arguments.predictor != "truth":
-        from caper_jax.estimator import load
-
-        estimator = load(category.name, *common.model_options(arguments))
-        weights = str(arguments.weights or f"shipped with the package ({category.name})")
-        if arguments.predictor == "model":
-            predictor = protocol.model_predictor(estimator)
-            if arguments.camera_roll:
-                weights += f", told of a camera roll of {arguments.camera_roll:g} deg"
-        elif "mean_pose" in estimator.card:
-            predictor = protocol.mean_predictor(category, estimator.card["mean_pose"], weights)
-        else:
-            raise CaperError(f"model {weights}: its card has no mean_pose; choose another model")
-
-    evaluation = protocol.evaluate(dataset, predictor, arguments.limit)
-    result = report.summarize(evaluation, dataset, arguments.predictor, weights)
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    report.write_report(arguments.out, evaluation, result)
+    estimator = weights = None
+    if options.predictor != "truth":
+        estimator, predictor, weights = _predictor(options, category)
+    evaluation = protocol.evaluate(dataset, predictor, options.frames)
+    result = report.summarize(evaluation, dataset, options.predictor, weights)
+    options.out.mkdir(parents=True, exist_ok=True)
+    report.write_report(options.out, evaluation, result)
     print(report.format_report(result))
     written = [report.METRICS_FILE, report.PREDICTIONS_FILE]
-    if arguments.worst:
-        _write_worst(arguments.out / WORST_FILE, dataset, estimator, evaluation, arguments.worst)
+    if options.worst and estimator is not None:
+        _write_worst(options.out / WORST_FILE, dataset, estimator, evaluation, options.worst)
         written.append(WORST_FILE)
-    print(f"\nwritten: {arguments.out / written[0]}, {', '.join(written[1:])}")
+    print(f"\nwritten: {options.out / written[0]}, {', '.join(written[1:])}")
     return 0
+
+
+def _predictor(options: Evaluate, category: Category) -> tuple[Estimator, Predictor, str]:
+    """The estimator, what it (or its training set's mean) predicts with, and which model it is.
+
+    Raises:
+      CaperError: see ``estimator.load``; a model that does not know its training set's mean.
+    """
+    from caper_jax.estimator import load
+    from caper_jax.evaluation import protocol
+
+    estimator = load(category.name, options.weights, options.object_scale, options.camera_roll)
+    weights = str(options.weights or f"shipped with the package ({category.name})")
+    if options.predictor == "model":
+        if options.camera_roll:
+            weights += f", told of a camera roll of {options.camera_roll:g} deg"
+        return estimator, protocol.model_predictor(estimator), weights
+    if "mean_pose" not in estimator.card:
+        raise CaperError(f"model {weights}: its card has no mean_pose; choose another model")
+    mean = protocol.mean_predictor(category, estimator.card["mean_pose"], weights)
+    return estimator, mean, weights
 
 
 def _write_worst(
@@ -132,8 +136,8 @@ def _write_worst(
     from caper_jax.visualization.picture import write_picture
     from caper_jax.visualization.scene import Scene
 
-    found, truth = evaluation.estimate.rotation, evaluation.truth.rotation
-    off = np.degrees(so3.geodesic_distance(found, truth)).max(-1)
+    estimates, truth = evaluation.estimate.rotation, evaluation.truth.rotation
+    off = np.degrees(so3.geodesic_distance(estimates, truth)).max(-1)
     off = np.where(evaluation.failed, -1.0, off)
     order = [
         int(index)
@@ -147,14 +151,14 @@ def _write_worst(
     for index in order:
         frame = dataset[index]
         print(f"  {off[index]:6.1f} deg  {frame.name}")
-        seen = estimator(cloud_of(frame, NUM_POINTS))
+        prediction = estimator(cloud_of(frame, NUM_POINTS))
         scenes.append(
             Scene(
                 name=frame.name,
                 category=dataset.category,
-                points=np.asarray(seen.points),
-                labels=np.asarray(seen.labels),
-                pose=jax.tree.map(np.asarray, seen.pose),
+                points=np.asarray(prediction.points),
+                labels=np.asarray(prediction.labels),
+                pose=jax.tree.map(np.asarray, prediction.pose),
                 truth=frame.truth,
                 depth=frame.depth,
                 mask=frame.mask,

@@ -2,67 +2,71 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from caper_jax.cli import common
+from caper_jax.cli.common import Positive
+from caper_jax.errors import CaperError
+
+EXAMPLES = (
+    ("--category box --out serving/box", "for CPU and NVIDIA GPUs, one cloud at a time"),
+    ("--category box --out serving/box --platform tpu --batch any", "batches of any size"),
+)
+_ANY = "any"
 
 
-def build_parser() -> argparse.ArgumentParser:
-    parser = common.create_parser(
-        "export",
-        "Writes a model as StableHLO with its weights inside, a manifest of its inputs and\n"
-        "outputs, and a short program that runs it with jax, numpy and flatbuffers alone.",
-        [
-            ("--category box --out serving/box", "for CPU and NVIDIA GPUs, one cloud at a time"),
-            ("--category box --out serving/box --platform tpu --batch any", "batches of any size"),
-        ],
-    )
-    parser.add_argument(
-        "--category", required=True, help="e.g. box, or FILE.py:NAME for one of your own"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write to")
-    parser.add_argument(
-        "--weights", type=Path, help="model directory (default: the shipped one of the category)"
-    )
-    parser.add_argument(
-        "--platform",
-        action="append",
-        metavar="P",
-        help="cpu, cuda, rocm or tpu; may be given several times (default: cpu and cuda)",
-    )
-    parser.add_argument(
-        "--batch",
-        type=_batch,
-        default=1,
-        metavar="N",
-        help="clouds per call, or 'any', which rounds otherwise than the package "
-        "(default: %(default)s)",
-    )
-    common.add_model_options(parser)
-    return parser
+@dataclass(frozen=True)
+class Export:
+    """Writes a model as StableHLO with its weights inside.
+
+    Beside it come a manifest of its inputs and outputs, and a short program that runs it with jax,
+    numpy and flatbuffers alone.
+
+    Attributes:
+      category: e.g. box, or FILE.py:NAME for one of your own
+      out: folder to write to
+      weights: model directory (default: the shipped one of the category)
+      platform: cpu, cuda, rocm or tpu (default: cpu and cuda)
+      batch: clouds per call, or any, which rounds otherwise than the package
+      object_scale: the objects are so many times as large as those the model was trained on
+      camera_roll: degrees by which the image shows things turned clockwise, 180 for upside down
+    """
+
+    category: str
+    out: Path
+    weights: Path | None = None
+    platform: tuple[str, ...] = ()
+    batch: str = "1"
+    object_scale: Positive = 1.0
+    camera_roll: float = 0.0
+
+    @property
+    def batch_size(self) -> int | None:
+        """None for any."""
+        return None if self.batch == _ANY else int(self.batch)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def parse(argv: Sequence[str]) -> Export:
+    options = common.parse(Export, argv, EXAMPLES)
+    if options.batch != _ANY and not (options.batch.isdecimal() and int(options.batch)):
+        raise CaperError(f"--batch: {options.batch!r} is neither {_ANY} nor a number of clouds")
+    common.check_folder(options.out, "--out")
+    return options
+
+
+def run(options: Export) -> int:
     """Runs the command; returns its exit code."""
-    arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
-    common.check_folder(arguments.out, "--out")
     from caper_jax.estimator import load
     from caper_jax.export import MODEL_FILE, RUNNER_FILE, export_estimator
 
-    estimator = load(arguments.category, *common.model_options(arguments))
-    batch = None if arguments.batch == "any" else arguments.batch
-    platforms = arguments.platform or ("cpu", "cuda")
-    manifest = export_estimator(estimator, arguments.out, platforms, batch)
-    size = (arguments.out / MODEL_FILE).stat().st_size
+    estimator = load(options.category, options.weights, options.object_scale, options.camera_roll)
+    platforms = options.platform or ("cpu", "cuda")
+    manifest = export_estimator(estimator, options.out, platforms, options.batch_size)
+    size = (options.out / MODEL_FILE).stat().st_size
     print(
-        f"written: {arguments.out} ({size / 1e6:.1f} MB for {', '.join(manifest['platforms'])}); "
-        f"run it with: python {arguments.out / RUNNER_FILE} cloud.npy poses.npz"
+        f"written: {options.out} ({size / 1e6:.1f} MB for {', '.join(manifest['platforms'])}); "
+        f"run it with: python {options.out / RUNNER_FILE} cloud.npy poses.npz"
     )
     return 0
-
-
-def _batch(text: str) -> int | str:
-    return text if text == "any" else common.positive_int(text)

@@ -7,61 +7,59 @@ through pyrealsense2, which this package does not install.
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from caper_jax.cli import common
+from caper_jax.cli.common import Count
 from caper_jax.data.clouds import cloud_from_depth, mask_from_box
 from caper_jax.data.live import pack_frame
 from caper_jax.errors import CaperError
 
 NUM_POINTS = 1024
+PROG = "python -m caper_jax.cli.realsense"
 
 
-def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m caper_jax.cli.realsense",
-        description="Writes the clouds of the object inside a fixed box of the depth image to\n"
-        "standard output, in the format of caper_jax/data/live.py. The table that it stands on is\n"
-        "taken away; a frame in which nothing stands there has no points.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "--box", required=True, type=common.pixel_box, help="x1,y1,x2,y2 in pixels of the depth"
-    )
-    parser.add_argument(
-        "--size",
-        type=common.positive_int,
-        nargs=2,
-        default=(640, 480),
-        metavar=("WIDTH", "HEIGHT"),
-        help="of the depth image (default: 640 480)",
-    )
-    parser.add_argument(
-        "--rate", type=common.positive_int, default=30, help="frames per second (default: 30)"
-    )
-    parser.add_argument("--limit", type=common.positive_int, help="stop after so many frames")
-    return parser
+@dataclass(frozen=True)
+class RealSense:
+    """Writes the clouds of the object inside a fixed box of the depth image to standard output.
+
+    The format is that of caper_jax/data/live.py. The table that the object stands on is taken
+    away; a frame in which nothing stands there has no points.
+
+    Attributes:
+      box: x1,y1,x2,y2 in pixels of the depth image
+      width: of the depth image, pixels
+      height: likewise
+      rate: frames per second
+      frames: stop after so many (default: never)
+    """
+
+    box: str
+    width: Count = 640
+    height: Count = 480
+    rate: Count = 30
+    frames: Count | None = None
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str]) -> int:
     """Runs the feeder; returns its exit code."""
-    arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
-    x1, y1, x2, y2 = arguments.box
-    width, height = arguments.size
+    options = common.parse(RealSense, argv, prog=PROG)
+    x1, y1, x2, y2 = box = common.pixel_box(options.box)
+    width, height = options.width, options.height
     if not (max(x1, 0) < min(x2, width) and max(y1, 0) < min(y2, height)):
-        raise CaperError(f"--box {x1:g},{y1:g},{x2:g},{y2:g} is empty in {width} x {height} pixels")
+        raise CaperError(f"--box {options.box} is empty in {width} x {height} pixels")
     if sys.stdout.isatty():
         raise CaperError("frames are bytes, no text: pipe them into caper track --live -")
-    for number, (depth, intrinsics) in enumerate(camera_frames(width, height, arguments.rate)):
-        sys.stdout.buffer.write(pack_frame(object_points(depth, intrinsics, arguments.box), number))
+    for number, (depth, intrinsics) in enumerate(camera_frames(width, height, options.rate)):
+        sys.stdout.buffer.write(pack_frame(object_points(depth, intrinsics, box), number))
         sys.stdout.buffer.flush()
-        if number + 1 == arguments.limit:
+        if number + 1 == options.frames:
             break
     return 0
 

@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
 import importlib
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
 
 from caper_jax.cli import common
-from caper_jax.machine import machine as describe_machine
+from caper_jax.cli.common import Count, Positive, Settings, Size
+from caper_jax.cli.train import SECTIONS as TRAINING_SECTIONS
+from caper_jax.cli.train import default_sections
+from caper_jax.errors import CaperError, unknown_name
 
 if TYPE_CHECKING:
     from caper_jax.reproduce.options import Options
     from caper_jax.reproduce.report import Report
+
+EXAMPLES = (
+    ("table1", "single frames, all categories of the table"),
+    ("table1 --data ROOT --format artimage --object-scale 3.7", "on the paper's data"),
+    ("table1 --noise none", "on clean depth, as the paper's ArtImage is rendered"),
+    ("table6 --category laptop", "one category, on generated videos"),
+    ("table6 --data PM-Videos --format pm-videos", "on the paper's data"),
+    ("table10 --weights runs/arm --frames 1000", "errors against frame, long videos"),
+    ("table9 --category box --seeds 3 --minutes 30", "trains six models"),
+    ("table7 --category laptop --steps 4000 --seeds 1", "trains two models"),
+    ("jitter --category box --videos 4", "a quick look"),
+)
+# ``Options`` names the settings of trainings, which the command line gives by section.
+SECTIONS = {name: text for name, text in TRAINING_SECTIONS.items() if name != "loader"}
 
 _TRACKING = (
     *("category", "videos", "frames", "mode", "data", "format", "split", "weights", "seed"),
@@ -27,7 +45,7 @@ _STATIC = (
 )
 _TRAINED = (
     *("category", "frames", "data", "format", "split", "seed", "noise"),
-    *("seeds", "minutes", "steps", "initial", "overrides"),
+    *("seeds", "minutes", "steps", "initial", "settings"),
 )
 _MOVING = ("category", "videos", "frames", "weights", "seed", "noise", "network_alone")
 
@@ -40,7 +58,7 @@ class Reproduction:
       module: of ``caper_jax.reproduce``, with ``run(name, options) -> Report``; imported
         only when it runs.
       summary: one line for --help.
-      options: those of ``OPTIONS`` that it takes, besides --out.
+      options: fields of ``Reproduce`` that it takes, besides out.
     """
 
     module: str
@@ -76,7 +94,7 @@ REPRODUCTIONS = {
         "Lie against Euclidean increments; trains both",
         (
             *("category", "videos", "frames", "mode", "data", "format", "split", "seed", "noise"),
-            *("seeds", "minutes", "steps", "initial", "overrides"),
+            *("seeds", "minutes", "steps", "initial", "settings"),
         ),
     ),
     "table10": Reproduction(
@@ -87,155 +105,111 @@ REPRODUCTIONS = {
     "modes": Reproduction("motion", "errors by how camera and joints move", _MOVING),
 }
 
-# Field of ``Options`` -> its arguments to argparse.
-OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
-    "category": (
-        "--category",
-        {"action": "append", "default": [], "help": "may be repeated (default: all of the table)"},
-    ),
-    "videos": (
-        "--videos",
-        {
-            "type": common.positive_int,
-            "metavar": "N",
-            "help": "per category (default: the paper's)",
-        },
-    ),
-    "frames": (
-        "--frames",
-        {
-            "type": common.positive_int,
-            "metavar": "T",
-            "help": "of each video, or of a test set of single frames (default: the paper's, or "
-            "1,000)",
-        },
-    ),
-    "mode": (
-        "--mode",
-        {
-            "choices": ("paper", "cam", "hard"),
-            "help": "how generated videos move (default: paper)",
-        },
-    ),
-    "data": (
-        "--data",
-        {"type": Path, "metavar": "ROOT", "help": "measure on a data set instead"},
-    ),
-    "format": ("--format", {"help": "layout of --data, as for caper evaluate"}),
-    "split": ("--split", {"help": "of --data (default: test)"}),
-    "weights": (
-        "--weights",
-        {
-            "type": Path,
-            "metavar": "DIR",
-            "help": "model directory, or folder with one per category (default: the shipped ones)",
-        },
-    ),
-    "object_scale": ("--object-scale", common.OBJECT_SCALE),
-    "seed": (
-        "--seed",
-        {
-            "type": common.non_negative_int,
-            "default": 0,
-            "help": "of generated frames and videos (default: %(default)s)",
-        },
-    ),
-    "noise": (
-        "--noise",
-        {"help": "of generated depth: none, gauss3mm, kinect or realsense (default: kinect)"},
-    ),
-    "given_masks": (
-        "--given-masks",
-        {"action": "store_true", "help": "add rows with the data's part labels"},
-    ),
-    "network_alone": (
-        "--network-alone",
-        {"action": "store_true", "help": "track without registration, as the paper does"},
-    ),
-    "seeds": (
-        "--seeds",
-        {
-            "type": common.positive_int,
-            "default": 3,
-            "metavar": "N",
-            "help": "runs of each kind (default: %(default)s)",
-        },
-    ),
-    "minutes": (
-        "--minutes",
-        {"type": common.positive_float, "help": "of training per run (default: 60)"},
-    ),
-    "steps": (
-        "--steps",
-        {"type": common.positive_int, "help": "of training per run, instead of --minutes"},
-    ),
-    "initial": (
-        "--from",
-        {
-            "type": common.model_folder,
-            "metavar": "DIR",
-            "dest": "initial",
-            "help": "model that each run starts from, as for caper train (default: none)",
-        },
-    ),
-    "overrides": (
-        "--set",
-        {
-            "action": "append",
-            "default": [],
-            "dest": "overrides",
-            "metavar": "KEY=VALUE",
-            "help": "another setting of the runs, as for caper train; may be repeated",
-        },
-    ),
-}
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Measures what a table of the paper shows.
+
+    Prints the paper's figures, ours, and what ours were measured on. Writes the same as markdown
+    and JSON, and pictures of curves.
+
+    Attributes:
+      category: a name, several with commas, or all (default: all of the table)
+      videos: per category (default: the paper's)
+      frames: of each video, or of a test set of single frames (default: the paper's, or 1,000)
+      mode: how generated videos move (default: paper)
+      data: measure on a data set instead
+      format: layout of --data, as for caper evaluate
+      split: of --data (default: test)
+      weights: model directory, or folder with one per category (default: the shipped ones)
+      object_scale: the objects are so many times as large as those the model was trained on, e.g.
+        3.7 for the laptops of PM-Videos and ArtImage (PartNet units read as meters)
+      seed: of generated frames and videos
+      noise: of generated depth (default: kinect)
+      given_masks: add rows with the data's part labels
+      network_alone: track without registration, as the paper does
+      seeds: runs to train of each kind
+      minutes: of training per run (default: 60)
+      steps: of training per run, instead of --minutes
+      initial: model that each run starts from, as for caper train (default: none)
+      out: folder of results, generated videos and runs
+      settings: of the runs, "section.key=value"
+    """
+
+    category: tuple[str, ...] = ()
+    videos: Count | None = None
+    frames: Count | None = None
+    mode: Literal["paper", "cam", "hard"] | None = None
+    data: Path | None = None
+    format: str | None = None
+    split: str | None = None
+    weights: Path | None = None
+    object_scale: Positive = 1.0
+    seed: Size = 0
+    noise: Literal["none", "gauss3mm", "kinect", "realsense"] | None = None
+    given_masks: bool = False
+    network_alone: bool = False
+    seeds: Count = 3
+    minutes: Positive | None = None
+    steps: Count | None = None
+    initial: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    out: Path = Path("outputs") / "reproduce"
+    settings: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
 
 
-def build_parser() -> argparse.ArgumentParser:
-    parser = common.create_parser(
-        "reproduce",
-        "Measures what a table of the paper shows and prints the paper's figures, ours, and what\n"
-        "ours were measured on. Writes the same as markdown and JSON, and pictures of curves.",
-        [
-            ("table1", "single frames, all categories of the table"),
-            ("table1 --data ROOT --format artimage --object-scale 3.7", "on the paper's data"),
-            ("table1 --noise none", "on clean depth, as the paper's ArtImage is rendered"),
-            ("table6 --category laptop", "one category, on generated videos"),
-            ("table6 --data PM-Videos --format pm-videos", "on the paper's data"),
-            ("table10 --weights runs/arm --frames 1000", "errors against frame, long videos"),
-            ("table9 --category box --seeds 3 --minutes 30", "trains six models"),
-            ("table7 --category laptop --steps 4000 --seeds 1", "trains two models"),
-            ("jitter --category box --videos 4", "a quick look"),
-        ],
+def parse(argv: Sequence[str]) -> tuple[str, Reproduce]:
+    """What to reproduce, and how.
+
+    Raises:
+      CaperError: no such table, or an option that it does not take.
+    """
+    name = argv[0] if argv and not argv[0].startswith("-") else None
+    if name is not None and name not in REPRODUCTIONS:
+        raise unknown_name("reproduction", name, REPRODUCTIONS)
+    rest = list(argv if name is None else argv[1:])
+    settings = Settings(SECTIONS, default_sections)
+    made, given = common.parse_with_settings(
+        Reproduce, rest, EXAMPLES, settings, prog="caper reproduce", notes=_what(name)
     )
-    commands = parser.add_subparsers(dest="reproduction", required=True, metavar="WHAT")
-    for name, reproduction in REPRODUCTIONS.items():
-        summary = reproduction.summary
-        command = commands.add_parser(name, help=summary, description=summary)
-        for option in reproduction.options:
-            flag, arguments = OPTIONS[option]
-            command.add_argument(flag, **arguments)
-        command.add_argument(
-            "--out",
-            type=Path,
-            default=Path("outputs") / "reproduce",
-            help="folder of results, generated videos and runs (default: %(default)s)",
-        )
-    return parser
+    if name is None:
+        raise CaperError(f"say what to reproduce: {', '.join(REPRODUCTIONS)}")
+    options = dataclasses.replace(made, settings=tuple(given))
+    for each in fields(Reproduce):
+        takes = each.name in (*REPRODUCTIONS[name].options, "out")
+        if not takes and getattr(options, each.name) != each.default:
+            taken = ", ".join(map(_flag, REPRODUCTIONS[name].options))
+            raise CaperError(f"{_flag(each.name)} is no option of {name}, which takes {taken}")
+    common.check_folder(options.out, "--out")
+    return name, options
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def _flag(option: str) -> str:
+    return "--section.key" if option == "settings" else common.flag(Reproduce, option)
+
+
+def _what(name: str | None) -> str:
+    """For --help: what can be reproduced, or which options one table takes."""
+    if name is not None:
+        options = REPRODUCTIONS[name].options
+        taken = " ".join(map(_flag, (*options, "out")))
+        return f"\n{name}: {REPRODUCTIONS[name].summary}; takes\n  {taken}\n"
+    lines = [f"  {key:<11}  {item.summary}\n" for key, item in REPRODUCTIONS.items()]
+    return "\nwhat to reproduce (caper reproduce WHAT [OPTIONS]):\n" + "".join(lines)
+
+
+def run(parsed: tuple[str, Reproduce]) -> int:
     """Runs the command; returns its exit code."""
-    arguments = vars(build_parser().parse_args(sys.argv[1:] if argv is None else argv))
-    name = arguments.pop("reproduction")
     from caper_jax.reproduce.options import Options
     from caper_jax.reproduce.report import markdown, write_report
 
-    values: dict[str, Any] = {
-        key: tuple(v) if isinstance(v, list) else v for key, v in arguments.items()
-    }
+    name, given = parsed
+    values: dict[str, Any] = dict(vars(given))
+    values["overrides"] = values.pop("settings")
+    # None: all of the table, which knows them.
+    values["category"] = tuple(common.chosen_categories(given.category, ()))
+    if given.initial is not None:
+        values["initial"] = common.model_folder(given.initial)
     options = Options(**values)
-    common.check_folder(options.out, "--out")
     module = importlib.import_module(f"caper_jax.reproduce.{REPRODUCTIONS[name].module}")
     report = _with_machine(module.run(name, options))
     options.out.mkdir(parents=True, exist_ok=True)
@@ -247,7 +221,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _with_machine(report: Report) -> Report:
     """The report with the machine that its times were measured on."""
-    machine = describe_machine()
+    from caper_jax.machine import machine as describe
+
+    machine = describe()
     fact = "machine: " + ", ".join(f"{name} {value}" for name, value in machine.items())
     result = {**report.result, "machine": machine}
     return replace(report, facts=[*report.facts, fact], result=result)

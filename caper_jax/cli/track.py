@@ -2,21 +2,41 @@
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
+import socket
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
 
 from caper_jax.cli import common
-from caper_jax.data.readers import formats
+from caper_jax.cli.common import Count, Positive, Settings
 from caper_jax.errors import CaperError
 
-# Options of recorded videos, by the attribute that argparse gives them.
+if TYPE_CHECKING:
+    from caper_jax.data.live import LiveFrame
+    from caper_jax.tracker import Tracker
+
+EXAMPLES = (
+    ("--category laptop --data kitchen --out outputs/kitchen", "a folder of images"),
+    ("--category box --data boxes.h5 --start truth --out outputs/b", "as the paper"),
+    ("--category box --data boxes.h5 --tracker.policy fixed --out outputs/f", "a setting"),
+    ("--category box --live 192.168.0.7:5000", "a stream, see below"),
+)
+SECTIONS = {"tracker": "keyframes, registration, variances"}
+STANDARD_INPUT = "-"
+# Options of recorded videos.
 _RECORDED = (
-    "format", "split", "official_split", "depth_scale", "video", "limit", "given_masks", "out",
-)  # fmt: skip
-_LAYOUTS = """\
+    *("data", "out", "format", "split", "official_split", "depth_scale"),
+    *("video", "videos", "given_masks"),
+)
+_CONNECT_S = 10.0
+NOTES = """\
 
 a folder of one's own (--format folder) holds depth/*.png (16-bit millimeters),
 mask/*.png of the same names and intrinsics.json (fx, fy, cx, cy), or folders that
@@ -32,121 +52,220 @@ RealSense camera sends them by (pip install pyrealsense2):
 """
 
 
-def build_parser() -> argparse.ArgumentParser:
-    parser = common.create_parser(
-        "track",
-        "Tracks one object through each video and writes to a folder, per video: the poses of\n"
-        "all frames (.jsonl), a contact sheet (.png) and curves of joint states and energy\n"
-        "(_states.png); and metrics.json where the data have ground truth.",
-        [
-            ("--category laptop --data kitchen --out outputs/kitchen", "a folder of images"),
-            ("--category box --data boxes.h5 --start truth --out outputs/b", "as the paper"),
-            ("--category box --live 192.168.0.7:5000", "a stream, see below"),
-        ],
-    )
-    assert parser.epilog is not None
-    parser.epilog += "\n" + _LAYOUTS
-    parser.add_argument(
-        "--category", required=True, help="e.g. box, or FILE.py:NAME for one of your own"
-    )
-    source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--data", type=Path, help="folder or .h5 with one video or several")
-    source.add_argument(
-        "--live", nargs="?", const="-", metavar="HOST:PORT", help="a stream; - is standard input"
-    )
-    parser.add_argument(
-        "--format",
-        help=f"layout of the data: {', '.join(formats(videos=True))} (default: caper for "
-        ".h5, folder for a folder with depth/)",
-    )
-    common.add_splits(parser)
-    parser.add_argument(
-        "--depth-scale",
-        type=common.positive_float,
-        help="meters per unit of the depth images of a folder",
-    )
-    parser.add_argument(
-        "--video", action="append", metavar="NAME", help="only this video; may be repeated"
-    )
-    parser.add_argument("--limit", type=common.positive_int, help="at most so many videos")
-    parser.add_argument(
-        "--start",
-        choices=("estimator", "truth"),
-        default="estimator",
-        help="where the first frame's pose comes from (default: %(default)s; the paper's tracker "
-        "begins with the truth)",
-    )
-    parser.add_argument(
-        "--given-masks",
-        action="store_true",
-        help="hand over the data's masks of the parts instead of predicting them",
-    )
-    parser.add_argument(
-        "--weights", type=Path, help="model directory (default: the shipped one of the category)"
-    )
-    parser.add_argument("--policy", help="of keyframes: dynamic, promote, fixed, none")
-    parser.add_argument(
-        "--interval", type=common.positive_int, help="frames between keyframes, of policy fixed"
-    )
-    parser.add_argument(
-        "--threshold", type=common.positive_float, help="of the energy, in object diagonals"
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="another setting of the tracker, e.g. filtered=false or registration.steps=0; may be "
-        "repeated",
-    )
-    common.add_model_options(parser)
-    parser.add_argument("--out", type=Path, help="folder for the results of --data")
-    return parser
+@dataclass(frozen=True)
+class Track:
+    """Tracks one object through each video, or through a live stream.
+
+    Writes to a folder, per video: the poses of all frames (.jsonl), a contact sheet (.png) and
+    curves of joint states and energy (_states.png); and metrics.json where the data have ground
+    truth. Of a stream it prints the poses.
+
+    Attributes:
+      category: e.g. box, or FILE.py:NAME for one of your own
+      data: folder or .h5 with one video or several
+      live: HOST:PORT of a stream instead, or - for standard input
+      out: folder for the results of --data
+      format: layout of the data: caper, captra, folder, pm-videos or reart-videos (default: caper
+        for .h5, folder for a folder with depth/)
+      split: split to read (default: all there is)
+      official_split: tell train from test by the published object ids, not by the lists of the
+        root
+      depth_scale: meters per unit of the depth images of a folder
+      video: only the video of this name
+      videos: at most so many videos
+      start: where the first frame's pose comes from (the paper's tracker begins with the truth)
+      given_masks: hand over the data's masks of the parts instead of predicting them
+      weights: model directory (default: the shipped one of the category)
+      object_scale: the objects are so many times as large as those the model was trained on, e.g.
+        3.7 for the laptops of PM-Videos and ArtImage (PartNet units read as meters)
+      camera_roll: degrees by which the images show things turned clockwise, 180 for upside down
+        (models know level cameras, within 15)
+      settings: of the tracker, "key=value"
+    """
+
+    category: str
+    data: Path | None = None
+    live: str | None = None
+    out: Path | None = None
+    format: str | None = None
+    split: str | None = None
+    official_split: bool = False
+    depth_scale: Positive | None = None
+    video: tuple[str, ...] = ()
+    videos: Count | None = None
+    start: Literal["estimator", "truth"] = "estimator"
+    given_masks: bool = False
+    weights: Path | None = None
+    object_scale: Positive = 1.0
+    camera_roll: float = 0.0
+    settings: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def parse(argv: Sequence[str]) -> Track:
+    made, given = common.parse_with_settings(
+        Track, argv, EXAMPLES, Settings(SECTIONS, _default_sections), notes=NOTES
+    )
+    # As ``load_tracker`` takes them.
+    settings = tuple(setting.removeprefix("tracker.") for setting in given)
+    options = dataclasses.replace(made, settings=settings)
+    if (options.data is None) == (options.live is None):
+        raise CaperError("give either --data, videos, or --live, a stream")
+    if options.live is not None:
+        _check_live(options, options.live)
+    elif options.out is None:
+        raise CaperError("--data needs --out, the folder for the results")
+    else:
+        common.check_folder(options.out, "--out")
+    return options
+
+
+def _default_sections() -> Mapping[str, Any]:
+    from caper_jax.config import TrackerConfig
+
+    return {"tracker": TrackerConfig()}
+
+
+def _check_live(options: Track, source: str) -> None:
+    for option in _RECORDED:
+        if getattr(options, option) not in (None, False, ()):
+            raise CaperError(f"--{option.replace('_', '-')} goes with --data, not --live")
+    if options.start == "truth":
+        raise CaperError("--start truth goes with --data: a stream has no ground truth")
+    if source == STANDARD_INPUT:
+        if sys.stdin.isatty():
+            raise CaperError(
+                "--live - reads binary frames from standard input, and that is a terminal; pipe "
+                "frames into it, or give HOST:PORT"
+            )
+        return
+    host, _, port = source.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
+        raise CaperError(f"--live {source}: give HOST:PORT, e.g. localhost:5000, or -")
+
+
+def run(options: Track) -> int:
     """Runs the command; returns its exit code."""
-    arguments = build_parser().parse_args(sys.argv[1:] if argv is None else argv)
-    from caper_jax.cli import track_live, track_videos
+    from caper_jax import categories
     from caper_jax.tracker import load_tracker
 
-    model = _model(arguments)
-    if arguments.live is not None:
-        _refuse_recorded(arguments)
-        with track_live.open_stream(arguments.live) as frames:
-            track_live.track_stream(load_tracker(**model), frames)
+    model: dict[str, Any] = {
+        "category": categories.get(options.category).name,
+        "weights": options.weights,
+        "config": options.settings,
+        "object_scale": options.object_scale,
+        "camera_roll": options.camera_roll,
+    }
+    if options.live is None:
+        _track_recorded(options, model)
         return 0
-    if arguments.out is None:
-        raise CaperError("--data needs --out, the folder for the results")
-    common.check_folder(arguments.out, "--out")
-    dataset, videos = track_videos.open_videos(arguments, model["category"])
-    recorder = track_videos.load_recorder(**model)
-    track_videos.track_all(arguments, recorder, dataset, videos)
+    tracker = load_tracker(**model)
+    warm_up(tracker)
+    print("ready", file=sys.stderr, flush=True)
+    with open_stream(options.live) as frames:
+        track_stream(tracker, frames)
     return 0
 
 
-def _model(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Which tracker: the arguments of ``load_tracker``."""
-    from caper_jax import categories
+def _track_recorded(options: Track, model: dict[str, Any]) -> None:
+    from caper_jax.cli.track_videos import choose, load_recorder, open_videos, track_all
 
-    settings = [
-        f"{key}={getattr(arguments, key)}"
-        for key in ("policy", "interval", "threshold")
-        if getattr(arguments, key) is not None
-    ]
-    weights, object_scale, camera_roll = common.model_options(arguments)
-    return {
-        "category": categories.get(arguments.category).name,
-        "weights": weights,
-        "config": settings + arguments.set,
-        "object_scale": object_scale,
-        "camera_roll": camera_roll,
-    }
+    assert options.data is not None and options.out is not None
+    dataset, videos = open_videos(
+        options.data,
+        model["category"],
+        format=options.format,
+        split=options.split,
+        official_split=options.official_split,
+        depth_scale=options.depth_scale,
+    )
+    videos = choose(videos, options.video, options.videos)
+    track_all(
+        load_recorder(**model),
+        dataset,
+        videos,
+        options.out,
+        start=options.start,
+        given_masks=options.given_masks,
+        weights=options.weights,
+    )
 
 
-def _refuse_recorded(arguments: argparse.Namespace) -> None:
-    for option in _RECORDED:
-        if getattr(arguments, option) not in (None, False):
-            raise CaperError(f"--{option.replace('_', '-')} goes with --data, not --live")
-    if arguments.start == "truth":
-        raise CaperError("--start truth goes with --data: a stream has no ground truth")
+# ----------------------------------------------------------------------------- live streams
+
+
+def warm_up(tracker: Tracker) -> None:
+    """Compiles the step on an empty frame, so that the first real one does not wait for it."""
+    import jax
+    import numpy as np
+
+    jax.block_until_ready(tracker(np.zeros((0, 3), np.float32)))
+    tracker.reset()
+
+
+@contextmanager
+def open_stream(source: str) -> Iterator[Iterable[LiveFrame]]:
+    """Frames of standard input, every one, or of a TCP server, the newest.
+
+    Args:
+      source: "-", or HOST:PORT to connect to.
+
+    Raises:
+      CaperError: nobody listens there.
+    """
+    from caper_jax.data.live import Newest, read_frames
+
+    if source == STANDARD_INPUT:
+        yield read_frames(sys.stdin.buffer)
+        return
+    host, _, port = source.rpartition(":")
+    try:
+        connection = socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S)
+    except OSError as error:
+        raise CaperError(
+            f"--live {source}: cannot connect ({error.strerror or error}); start the sender first"
+        ) from error
+    with connection, connection.makefile("rb") as stream:
+        connection.settimeout(None)  # a camera may pause
+        try:
+            yield Newest(read_frames(stream))
+        finally:
+            # Its thread may wait for a frame, and nobody can close what is being read.
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+
+
+def track_stream(tracker: Tracker, frames: Iterable[LiveFrame]) -> None:
+    """Prints one JSON object per frame until the stream ends, then a summary to standard error.
+
+    Args:
+      tracker: compiled and reset, see ``warm_up``.
+      frames: e.g. from ``open_stream``.
+
+    Raises:
+      CaperError: a broken stream, or points that cannot be meters.
+    """
+    import jax
+    import numpy as np
+
+    from caper_jax.evaluation.records import frame_record, json_line
+
+    category = tracker.estimator.category
+    skipped, lost, seconds = 0, 0, []
+    try:
+        for frame in frames:
+            began = time.perf_counter()
+            try:
+                result = jax.block_until_ready(tracker(frame.points))
+            except CaperError as error:
+                raise CaperError(f"frame {frame.sequence}: {error}") from error
+            seconds.append(time.perf_counter() - began)
+            record = frame_record(frame.sequence, result, category, seconds[-1])
+            print(json_line({**record, "skipped": frame.skipped}), flush=True)
+            skipped += frame.skipped
+            lost += record["lost"]
+    finally:
+        speed = f", {1000 * np.median(seconds):.1f} ms per frame (median)" if seconds else ""
+        print(
+            f"{len(seconds)} frames tracked, lost in {lost}; {skipped} skipped{speed}",
+            file=sys.stderr,
+        )

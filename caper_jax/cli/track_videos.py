@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -22,6 +21,7 @@ from caper_jax.estimator import load
 from caper_jax.evaluation.records import json_line
 from caper_jax.evaluation.report import METRICS_FILE
 from caper_jax.evaluation.tracking import (
+    Start,
     Track,
     format_tracks,
     summarize_tracks,
@@ -70,37 +70,48 @@ def load_recorder(
 
 
 def open_videos(
-    arguments: argparse.Namespace, category: str
+    data: Path,
+    category: str,
+    *,
+    format: str | None = None,
+    split: str | None = None,
+    official_split: bool = False,
+    depth_scale: float | None = None,
 ) -> tuple[Dataset, dict[str, list[int]]]:
-    """The dataset and the chosen videos: name -> indices of the frames, in the order of time.
+    """The dataset and its videos: name -> indices of the frames, in the order of time.
 
     Raises:
-      CaperError: no such data, a layout that cannot be told or has no videos, options that do not
-        go with it, or a video that it does not hold.
+      CaperError: no such data, a layout that cannot be told or has no videos, or options that do
+        not go with it.
     """
-    layout = arguments.format or _guess_format(arguments.data)
+    layout = format or _guess_format(data)
     if layout not in formats(videos=True):
         raise unknown_name("format of videos", layout, formats(videos=True))
-    if layout != FOLDER and arguments.depth_scale is not None:
+    if layout != FOLDER and depth_scale is not None:
         raise CaperError(f"--depth-scale goes with --format {FOLDER}, not {layout}")
-    dataset = open_dataset(
-        layout,
-        arguments.data,
-        category,
-        arguments.split,
-        arguments.official_split,
-        **({"depth_scale": arguments.depth_scale} if layout == FOLDER else {}),
-    )
+    options: dict[str, Any] = {"depth_scale": depth_scale} if layout == FOLDER else {}
+    dataset = open_dataset(layout, data, category, split, official_split, **options)
     videos = dataset.videos()
     if not videos:
         raise CaperError(
-            f"{arguments.data}: holds single frames, no videos; measure them with caper evaluate"
+            f"{data}: holds single frames, no videos; measure them with caper evaluate"
         )
-    for name in arguments.video or ():
+    return dataset, videos
+
+
+def choose(
+    videos: dict[str, list[int]], names: Sequence[str], count: int | None
+) -> dict[str, list[int]]:
+    """The videos of these names, or all; at most so many.
+
+    Raises:
+      CaperError: a video that is not there.
+    """
+    for name in names:
         if name not in videos:
             raise unknown_name("video", name, videos)
-    chosen = [name for name in videos if arguments.video is None or name in arguments.video]
-    return dataset, {name: videos[name] for name in chosen[: arguments.limit]}
+    chosen = [name for name in videos if not names or name in names]
+    return {name: videos[name] for name in chosen[:count]}
 
 
 def _guess_format(data: Path) -> str:
@@ -114,32 +125,37 @@ def _guess_format(data: Path) -> str:
 
 
 def track_all(
-    arguments: argparse.Namespace,
     tracker: Recorder,
     dataset: Dataset,
     videos: dict[str, list[int]],
+    out: Path,
+    *,
+    start: Start,
+    given_masks: bool,
+    weights: Path | None,
 ) -> None:
-    """Tracks through the videos, writes everything to ``--out`` and prints the tables.
+    """Tracks through the videos, writes everything to a folder and prints the tables.
 
     Every video's files are written before the next one begins.
+
+    Args:
+      tracker: of the dataset's category.
+      dataset, videos: see ``open_videos``.
+      out: the folder; made where it is missing.
+      start, given_masks: see ``track_video``.
+      weights: where the model came from, for metrics.json; None for the one that ships.
     """
-    category, config, out = dataset.category, tracker.config, arguments.out
-    threshold = config.threshold if config.policy in ("dynamic", "promote") else None
+    category, config = dataset.category, tracker.config
     out.mkdir(parents=True, exist_ok=True)
     tracks = []
     with progress("loading, compiling, tracking", sum(map(len, videos.values()))) as bar:
         for (name, indices), stem in zip(videos.items(), file_stems(videos), strict=True):
             kept: dict[int, Frame] = {}
             frames = _frames(dataset, indices, kept, bar)
-            track = track_video(tracker, name, frames, arguments.start, arguments.given_masks)
-            lines = "".join(json_line(row) + "\n" for row in track_records(track, category))
-            write_atomically(out / f"{stem}.jsonl", lines.encode())
-            tiles = [_tile(number, frame, track, tracker) for number, frame in kept.items()]
-            write_sheet(out / f"{stem}.png", name, tiles)
-            write_states(out / f"{stem}_states.png", track, category, threshold)
+            track = track_video(tracker, name, frames, start, given_masks)
+            _write_video(out, stem, track, kept, tracker)
             tracks.append(track)
-    part_masks = "given" if arguments.given_masks else "predicted"
-    facts = (arguments.start, dataset.mask_source, part_masks)
+    facts = (start, dataset.mask_source, "given" if given_masks else "predicted")
     measured = [track for track in tracks if track.truth is not None]
     metrics = None
     (out / METRICS_FILE).unlink(missing_ok=True)  # an earlier run's would stand beside these tracks
@@ -148,7 +164,7 @@ def track_all(
         metrics |= {
             "format": dataset.format,
             "split": dataset.split,
-            "weights": str(arguments.weights or f"shipped with the package ({category.name})"),
+            "weights": str(weights or f"shipped with the package ({category.name})"),
             "tracker": to_dict(config),
         }
         text = json.dumps(metrics, indent=2, allow_nan=False)
@@ -158,6 +174,19 @@ def track_all(
     stem = file_stems(videos)[0] if len(videos) == 1 else "<video>"
     written += [f"{stem}.jsonl", f"{stem}.png", f"{stem}_states.png"]
     print(f"\nwritten to {out}: {', '.join(written)}")
+
+
+def _write_video(
+    out: Path, stem: str, track: Track, kept: dict[int, Frame], tracker: Recorder
+) -> None:
+    """Poses, contact sheet and curves of one video."""
+    category, config = tracker.estimator.category, tracker.config
+    lines = "".join(json_line(row) + "\n" for row in track_records(track, category))
+    write_atomically(out / f"{stem}.jsonl", lines.encode())
+    tiles = [_tile(number, frame, track, tracker) for number, frame in kept.items()]
+    write_sheet(out / f"{stem}.png", track.name, tiles)
+    threshold = config.threshold if config.policy in ("dynamic", "promote") else None
+    write_states(out / f"{stem}_states.png", track, category, threshold)
 
 
 def file_stems(videos: Iterable[str]) -> list[str]:

@@ -14,7 +14,7 @@ from _helpers.frames import random_frames
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
-from caper_jax.cli.generate import main as generate
+from caper_jax.cli import generate
 from caper_jax.config import GeneratorConfig, to_dict
 from caper_jax.data import hdf5
 from caper_jax.data.readers import open_dataset
@@ -46,7 +46,8 @@ def test_the_command_draws_frames_of_it(tmp_path):
     path = tmp_path / "frames.h5"
     options = {"frames": 12, "instances": 8, "points": 256, "grid": 40, "noise": "none"}
     options |= {"category": f"{FILE}:MICROWAVE", "out": path}
-    assert generate([f"--{key}={value}" for key, value in options.items()]) == 0
+    arguments = [f"--{key}={value}" for key, value in options.items()]
+    assert generate.run(generate.parse(arguments)) == 0
     dataset = hdf5.Hdf5Dataset(path)
     assert dataset.category is categories.get("microwave") and len(dataset) == 12
     for index in range(12):

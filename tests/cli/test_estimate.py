@@ -72,22 +72,20 @@ def test_pose_is_printed_and_written(files, seen, capsys):
     (cloud,) = seen
     assert cloud.shape == (1, 1024, 3) and cloud.dtype == np.float32
     np.testing.assert_allclose(cloud[..., 2], 0.78, rtol=1e-6)
-    result = json.loads((files / "pose.json").read_text())
+    record = json.loads((files / "pose.json").read_text())
     pose = jax.tree.map(lambda array: array[0], random_pose(1))
-    assert result["category"] == "box" and result["parts"] == ["base", "lid"]
-    assert result["units"] == {"length": "meters", "joint_state": ["degrees"]}
-    assert "OpenCV" in result["frame"]
-    assert result["points"] == {"available": 1999, "dropped": 1, "of_parts": [1021, 3]}
-    assert result["hidden"] == [False, True]
-    deviation = result["standard_deviation"]
-    np.testing.assert_allclose(deviation["rotation_deg"], [1.25, 2.5], rtol=1e-6)
-    np.testing.assert_allclose(deviation["translation"], [0.004, 0.006], rtol=1e-6)
-    np.testing.assert_allclose(deviation["joint_state"], [3.0], rtol=1e-6)
-    assert result["confidence"] == [0.75, 0.5]
-    assert list(result["pose"]) == list(vars(pose))
-    for key, expected in vars(pose).items():
-        expected = np.degrees(expected) if key == "joint_state" else expected
-        np.testing.assert_allclose(result["pose"][key], expected, rtol=1e-6)
+    assert record["category"] == "box" and record["name"] == "depth.png"
+    assert record["points"] == {"available": 1999, "dropped": 1}
+    assert record["confidence"] == [0.75, 0.5]
+    base, lid = record["parts"]
+    assert (base["name"], base["points"], base["hidden"]) == ("base", 1021, False)
+    assert (lid["name"], lid["points"], lid["hidden"]) == ("lid", 3, True)
+    assert lid["rotation_std_deg"] == pytest.approx(2.5)
+    assert lid["translation_std"] == pytest.approx(0.006)
+    np.testing.assert_allclose(lid["rotation"], pose.rotation[1], atol=1e-6)
+    (joint,) = record["joints"]
+    assert joint["state"] == pytest.approx(np.degrees(pose.joint_state[0]), rel=1e-5)
+    assert joint["state_std"] == pytest.approx(3.0)
     table = capsys.readouterr().out
     assert f"{np.degrees(pose.joint_state[0]):.1f}°" in table
     assert " ".join(f"{value:.3f}" for value in pose.translation[1]) in table
@@ -136,10 +134,10 @@ def test_pictures_and_pages_are_written(files, seen):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([*IMAGE], "--depth needs --mask or --box"),
+        ([*IMAGE], "--depth needs either --mask or --box"),
         (["--depth", "depth.png", "--mask", "mask.png"], "--depth needs --intrinsics"),
         ([*IMAGE, "--mask", "absent.png"], "absent.png: no such file"),
-        ([*IMAGE, "--mask", "mask.png", "--box", "1,2,3,4"], "not allowed with"),
+        ([*IMAGE, "--mask", "mask.png", "--box", "1,2,3,4"], "--mask or --box"),
         ([*IMAGE, "--box", "1,2,3"], "is not x1,y1,x2,y2"),
         ([*IMAGE, "--box", "200,1,300,9"], "is empty in the 160 x 120 image"),
         (["--points", "cloud.npy", "--mask", "mask.png"], "--mask goes with --depth"),

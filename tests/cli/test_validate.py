@@ -207,7 +207,7 @@ def test_poses_of_other_frames_are_noticed(tmp_path):
         (["--format", "reartmix"], "holds no reartmix data of a known category"),
         (["--format", "caper"], "no such file but a folder (format 'caper' is one .h5 file; name"),
         (["--format", "caper", "--data", "no.h5"], "no.h5: no such file (format 'caper'"),
-        (["--workers", "0"], "whole number above 0"),
+        (["--workers", "0"], "--workers must be at least 1"),
     ],
 )
 def test_mistakes_in_the_arguments_are_code_2(tmp_path, capsys, options, message):

@@ -206,13 +206,13 @@ def test_the_mean_stands_at_the_cloud_and_obeys_kinematics(path):
 
 def test_results_name_the_roll_that_the_model_was_told_of(path, tmp_path, estimator):
     for options, told in (((), False), (("--camera-roll", "-90"), True)):
-        assert run(path, tmp_path, "--limit", "5", *options) == 0
+        assert run(path, tmp_path, "--frames", "5", *options) == 0
         weights = json.loads((tmp_path / "metrics.json").read_text())["weights"]
         assert weights.endswith(", told of a camera roll of -90 deg") == told
 
 
 def test_mean_predictor_runs_from_the_card(path, tmp_path, estimator, capsys):
-    assert run(path, tmp_path, "--predictor", "mean", "--limit", "5") == 0
+    assert run(path, tmp_path, "--predictor", "mean", "--frames", "5") == 0
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["frames"] == 5 and metrics["predictor"] == "mean"
     for broken, message in (
@@ -355,7 +355,7 @@ def test_clouds_are_spread_over_all_points(path):
         (["--category", "bxo"], "unknown category 'bxo'; did you mean 'box'"),
         (["--split", "train"], "holds split 'test', not 'train'"),
         (["--data", "absent.h5"], "absent.h5: no such file"),
-        (["--limit", "0"], "whole number above 0"),
+        (["--frames", "0"], "--frames must be at least 1, got 0"),
         (["--predictor", "best"], "invalid choice"),
     ],
 )
@@ -381,7 +381,7 @@ def test_reartmix_truth_scores_perfectly(shared_data, tmp_path, capsys):
     assert (
         cli.main(
             ["evaluate", "--category", "box", "--format", "reartmix", "--predictor", "truth"]
-            + ["--data", str(shared_data / "reartmix_box"), "--out", str(tmp_path), "--limit", "8"]
+            + ["--data", str(shared_data / "reartmix_box"), "--out", str(tmp_path), "--frames", "8"]
         )
         == 0
     )

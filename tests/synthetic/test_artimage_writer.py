@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from caper_jax import categories
 from caper_jax.articulation.category import Joint
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.cli import generate, generate_layout
+from caper_jax.cli import generate
 from caper_jax.data.readers import open_dataset
 from caper_jax.data.types import validate
 from caper_jax.errors import CaperError
@@ -100,13 +100,13 @@ def test_every_category_reads_back(tmp_path, name):
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setattr(generate_layout, "SIZE", SIZE)
-    monkeypatch.setattr(generate_layout, "FOCAL", 91.4)
+    monkeypatch.setattr(generate, "SIZE", SIZE)
+    monkeypatch.setattr(generate, "FOCAL", 91.4)
 
 
 def run(out, *arguments):
     common = ["--category", "laptop", "--noise", "none", "--seed", "5", "--out", str(out)]
-    assert generate.main([*common, *arguments]) == 0
+    assert generate.run(generate.parse([*common, *arguments])) == 0
 
 
 def assert_whole(frame):

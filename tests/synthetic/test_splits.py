@@ -39,7 +39,7 @@ def test_every_split_has_its_own_keys(options, owner, name, tmp_path, monkeypatc
         if "--videos" not in options:
             asked += ["--frames", "2"]
         with pytest.raises(Drawn) as drawn:
-            generate.main([*asked, *options])
+            generate.run(generate.parse([*asked, *options]))
         method = owner in (frames.Generator, videos.VideoGenerator)
         keys[split] = jax.random.key_data(drawn.value.args[0][1 if method else 0])
     # That of the published test sets.

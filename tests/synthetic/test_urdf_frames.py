@@ -17,8 +17,8 @@ from _helpers.solid_meshes import mesh_object
 from _helpers.urdf_models import partnet_drawer, partnet_laptop
 from PIL import Image
 
+from caper_jax import cli
 from caper_jax.categories.laptop import LAPTOP
-from caper_jax.cli import common, generate
 from caper_jax.data.readers import open_dataset
 from caper_jax.data.types import validate
 from caper_jax.data.urdf.canonical import ImportedObject, JointMap
@@ -120,7 +120,7 @@ def test_rays_meet_a_cube_where_they_should():
 
 
 def run(*arguments):
-    return common.run(generate.main, [str(argument) for argument in arguments], command="generate")
+    return cli.main(["generate", *map(str, arguments)])
 
 
 def test_command_imports_a_folder_of_models(tmp_path, capsys):

@@ -42,7 +42,8 @@ def test_the_command_writes_rows_of_tiles(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(gallery, "render_instances", lambda *arguments: tiles)
     out = tmp_path / "new" / "some.png"
     assert (
-        cli.main(["gallery", "--category", "box", "laptop", "--count", "2", "--out", str(out)]) == 0
+        cli.main(["gallery", "--category", "box,laptop", "--instances", "2", "--out", str(out)])
+        == 0
     )
     with Image.open(out) as picture:
         assert picture.width == 2 * gallery.TILE and picture.height > 2 * gallery.TILE
