@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         number = RefinerConfig().frames if arguments.sides is True else arguments.sides
         options = {"frames": number, "seed": arguments.seed}
-        fit_refiner.add_sides(arguments.weights, arguments.category, TRAINING_DATA, **options)
+        fit_refiner.add_refiner(arguments.weights, arguments.category, TRAINING_DATA, **options)
     estimator = load(arguments.category, arguments.weights)
     section = calibrate(estimator, TRAINING_DATA, frames, arguments.seed)
     write_card(arguments.weights, {**estimator.card, "calibration": section})

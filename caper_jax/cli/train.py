@@ -129,12 +129,12 @@ def _plot(category: str, out: Path) -> None:
     """Writes curves.png beside the metrics it shows."""
     import jax
 
-    from caper_jax.training.metrics_log import FILE, read_metrics
+    from caper_jax.training.run_directory import METRICS_FILE, read_metrics
     from caper_jax.visualization.curves import training_curves, write_curves
 
-    if jax.process_index() or not (out / FILE).is_file():
+    if jax.process_index() or not (out / METRICS_FILE).is_file():
         return
-    if rows := read_metrics(out / FILE):
+    if rows := read_metrics(out / METRICS_FILE):
         write_curves(out / "curves.png", training_curves(f"Training of {category}", rows))
 
 
