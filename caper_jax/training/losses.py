@@ -10,19 +10,24 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from caper_jax.config import HeatmapKind, LossWeights
 
+PerSample = Float[Array, " batch"]
+Directions = Float[Array, "batch 2 3"]
+JointVectors = Float[Array, "batch joints 3"]
+JointValues = Float[Array, "batch joints"]
+Heatmap = Float[Array, "batch points joints"]
+Offsets = Float[Array, "batch points joints 3"]
 
-def _per_sample(values: Float[Array, "batch ..."]) -> Float[Array, " batch"]:
+
+def _per_sample(values: Float[Array, "batch ..."]) -> PerSample:
     """Mean over all axes but the first."""
     return values.reshape(values.shape[0], -1).mean(axis=1)
 
 
-def rotation_loss(
-    predicted: Float[ArrayLike, "batch 2 3"], target: Float[ArrayLike, "batch 2 3"]
-) -> Float[Array, " batch"]:
+def rotation_loss(predicted: Directions, target: Directions) -> PerSample:
     """Eq 17, rotation: L1 of both directions, [B, 2, 3] -> [B] (mean over xyz, sum over the two).
 
     The mean, not the sum, over components: the weights of Eq 22 assume it.
@@ -31,18 +36,18 @@ def rotation_loss(
 
 
 def translation_loss(
-    predicted: Float[ArrayLike, "batch 3"], target: Float[ArrayLike, "batch 3"]
-) -> Float[Array, " batch"]:
+    predicted: Float[Array, "batch 3"], target: Float[Array, "batch 3"]
+) -> PerSample:
     """Eq 17, translation: mean absolute difference, [B, 3] -> [B]."""
     return jnp.abs(predicted - target).mean(-1)
 
 
 def confidence_loss(
-    confidence: Float[ArrayLike, "batch 2"],
-    predicted: Float[ArrayLike, "batch 2 3"],
-    target: Float[ArrayLike, "batch 2 3"],
+    confidence: Float[Array, "batch 2"],
+    predicted: Directions,
+    target: Directions,
     sharpness: float = 13.7,
-) -> Float[Array, " batch"]:
+) -> PerSample:
     """Eq 18: the correction factor of each direction learns how good that direction is.
 
     |psi_i - exp(-13.7 |r_i - r^_i|^2)|: the sign and the constant are missing in the paper. Each
@@ -61,10 +66,8 @@ def confidence_loss(
 
 
 def axis_offsets(
-    points: Float[Array, "batch points 3"],
-    axis: Float[Array, "batch joints 3"],
-    pivot: Float[Array, "batch joints 3"],
-) -> Float[Array, "batch points joints 3"]:
+    points: Float[Array, "batch points 3"], axis: JointVectors, pivot: JointVectors
+) -> Offsets:
     """Eq 4 as a vector: from each point to its foot on each joint axis.
 
     Args:
@@ -82,10 +85,8 @@ def axis_offsets(
 
 
 def heatmap_target(
-    distance: Float[Array, "batch points joints"],
-    kind: HeatmapKind = "exponential",
-    gate: float = 0.2,
-) -> Float[Array, "batch points joints"]:
+    distance: Heatmap, kind: HeatmapKind = "exponential", gate: float = 0.2
+) -> Heatmap:
     """Eq 5: weight of each point's vote, zero beyond ``gate`` times the farthest point.
 
     Args:
@@ -105,19 +106,12 @@ def heatmap_target(
     return jnp.where(distance < reach, value, 0.0)
 
 
-def heatmap_loss(
-    predicted: Float[ArrayLike, "batch points joints"],
-    target: Float[ArrayLike, "batch points joints"],
-) -> Float[Array, " batch"]:
+def heatmap_loss(predicted: Heatmap, target: Heatmap) -> PerSample:
     """Mean absolute difference of the heatmaps, [B, N, J] -> [B]."""
     return _per_sample(jnp.abs(predicted - target))
 
 
-def offset_loss(
-    predicted: Float[Array, "batch points joints 3"],
-    target: Float[ArrayLike, "batch points joints 3"],
-    heatmap: Float[Array, "batch points joints"],
-) -> Float[Array, " batch"]:
+def offset_loss(predicted: Offsets, target: Offsets, heatmap: Heatmap) -> PerSample:
     """L1 of the offsets over the points that vote (target heatmap > 0), [B, N, J, 3] -> [B].
 
     A joint for which no point lies inside the gate adds nothing.
@@ -128,11 +122,11 @@ def offset_loss(
 
 
 def location_loss(
-    pivot: Float[ArrayLike, "batch joints 3"],
-    axis: Float[ArrayLike, "batch joints 3"],
-    true_pivot: Float[ArrayLike, "batch joints 3"],
-    revolute: Bool[ArrayLike, " joints"] | Sequence[bool],
-) -> Float[Array, " batch"]:
+    pivot: JointVectors,
+    axis: JointVectors,
+    true_pivot: JointVectors,
+    revolute: Bool[Array, " joints"] | Sequence[bool],
+) -> PerSample:
     """Eq 19: distance of the predicted pivot from the true joint line.
 
     Args:
@@ -150,18 +144,14 @@ def location_loss(
     return (distance * jnp.asarray(revolute, distance.dtype)).mean(-1)
 
 
-def direction_loss(
-    axis: Float[ArrayLike, "batch joints 3"], true_axis: Float[ArrayLike, "batch joints 3"]
-) -> Float[Array, " batch"]:
+def direction_loss(axis: JointVectors, true_axis: JointVectors) -> PerSample:
     """Mean absolute difference of unit joint directions, [B, J, 3] -> [B]."""
     return _per_sample(jnp.abs(axis - true_axis))
 
 
 def state_loss(
-    state: Float[ArrayLike, "batch joints"],
-    true_state: Float[ArrayLike, "batch joints"],
-    penalty: Float[ArrayLike, ""] = 20.0,
-) -> Float[Array, " batch"]:
+    state: JointValues, true_state: JointValues, penalty: float | Array = 20.0
+) -> PerSample:
     """Eq 20: L1 of the joint states, ``penalty`` times where the sign is wrong, [B, J] -> [B].
 
     The case is decided per joint, and a product of exactly zero counts as wrong (errata).
@@ -171,15 +161,15 @@ def state_loss(
 
 
 def scale_loss(
-    size: Float[ArrayLike, "batch parts 3"], true_size: Float[ArrayLike, "batch parts 3"]
-) -> Float[Array, " batch"]:
+    size: Float[Array, "batch parts 3"], true_size: Float[Array, "batch parts 3"]
+) -> PerSample:
     """Mean absolute difference of part sizes (or box centers), [B, K, 3] -> [B]."""
     return _per_sample(jnp.abs(size - true_size))
 
 
 def segmentation_loss(
-    logits: Float[ArrayLike, "batch points parts"], labels: Int[ArrayLike, "batch points"]
-) -> Float[Array, " batch"]:
+    logits: Float[Array, "batch points parts"], labels: Int[Array, "batch points"]
+) -> PerSample:
     """Cross entropy of the part labels, [B, N, K] and [B, N] -> [B]; label -1 is left out."""
     valid = labels >= 0
     log_probability = jax.nn.log_softmax(logits)
@@ -188,8 +178,8 @@ def segmentation_loss(
 
 
 def twist_loss(
-    twist: Float[ArrayLike, "batch numbers"], true_twist: Float[ArrayLike, "batch numbers"]
-) -> Float[Array, " batch"]:
+    twist: Float[Array, "batch numbers"], true_twist: Float[Array, "batch numbers"]
+) -> PerSample:
     """Eq 21: L1 of the se(3) coordinates (w, rho), [B, 6] -> [B] (mean over each half, summed).
 
     Also for increments in Euclidean coordinates, [B, 9]: two axes, then the translation.
@@ -200,15 +190,13 @@ def twist_loss(
 
 def rotation_class_loss(
     logits: Float[Array, "batch 24"], rotation_class: Int[Array, " batch"]
-) -> Float[Array, " batch"]:
+) -> PerSample:
     """Cross entropy of the cube rotation that the reference is off by, [B, 24] and [B] -> [B]."""
     chosen = rotation_class[:, None]
     return -jnp.take_along_axis(jax.nn.log_softmax(logits), chosen, axis=-1)[:, 0]
 
 
-def weighted_total(
-    weights: LossWeights, losses: dict[str, Float[Array, " batch"]]
-) -> Float[Array, " batch"]:
+def weighted_total(weights: LossWeights, losses: dict[str, PerSample]) -> PerSample:
     """Eqs 22 and 23: the weighted sum of the losses of one stage, [B].
 
     Args:

@@ -45,6 +45,10 @@ from caper_jax.training import losses
 
 PyTree = Any
 Terms = dict[str, Array]
+Scalar = Float[Array, ""]
+Rotations = Float[Array, "batch 3 3"]
+Poses = Float[Array, "batch 4 4"]
+Classes = Int[Array, " batch"]
 
 _PREDICTION_LIMIT = np.radians(25.0)  # beyond it, stage I's own root pose is no reference
 
@@ -209,7 +213,7 @@ class Objective:
 
     def __call__(
         self, params: PyTree, model_state: PyTree, batch: Any, key: Array, progress: Any = 0.0
-    ) -> tuple[Float[Array, ""], tuple[PyTree, dict[str, Array]]]:
+    ) -> tuple[Scalar, tuple[PyTree, dict[str, Array]]]:
         """Eqs 22 + 23 on one batch.
 
         Args:
@@ -230,7 +234,7 @@ class Objective:
 
     def stage1(
         self, params: PyTree, model_state: PyTree, batch: Any, key: Array
-    ) -> tuple[Float[Array, ""], RootResult]:
+    ) -> tuple[Scalar, RootResult]:
         """Eq 22 on one batch, and what stage II needs; ``params`` are stage I's own."""
         order = raster_order(batch.points)
         batch = replace(
@@ -246,21 +250,21 @@ class Objective:
         outputs, new_state = self._apply(
             "root", params, model_state, rotate(view, visible) * unit, jax.random.split(key, 4)[0]
         )
-        truth, labels = self._nearest_symmetry(outputs, batch, view)
-        terms = stage1_loss(outputs, self._root_targets(truth), self.config)
+        truth, labels, terms = self._nearest_symmetry(outputs, batch, view)
         result = RootResult(
             points=rotate(view, batch.points) * unit,
             labels=labels,
             truth=truth,
             outputs=outputs,
             model_state=new_state,
-            metrics={name: value.mean() for name, value in terms.items() if name != "total"},
+            metrics={name: value.mean() for name, value in terms.items()},
         )
-        return terms["total"].mean(), stop_gradient(result)
+        total = losses.weighted_total(self.config.weights, terms)
+        return total.mean(), stop_gradient(result)
 
     def stage2(
         self, params: PyTree, model_state: PyTree, result: RootResult, key: Array
-    ) -> tuple[Float[Array, ""], tuple[PyTree, dict[str, Array]]]:
+    ) -> tuple[Scalar, tuple[PyTree, dict[str, Array]]]:
         """Eq 23 on one batch; ``params`` are stage II's own.
 
         Returns:
@@ -303,7 +307,7 @@ class Objective:
             mutable=list(state),
         )
 
-    def _truth(self, pose: ArticulatedPose, view: Float[Array, "batch 3 3"]) -> ArticulatedPose:
+    def _truth(self, pose: ArticulatedPose, view: Rotations) -> ArticulatedPose:
         """A pose in the viewing frame and network units; sizes and centers less their means."""
         unit = self.category.unit
         mean_size = np.asarray(self.category.mean_size, np.float32)
@@ -328,22 +332,24 @@ class Objective:
         )
 
     def _nearest_symmetry(
-        self, outputs: RootOutput, batch: Any, view: Float[Array, "batch 3 3"]
-    ) -> tuple[ArticulatedPose, Int[Array, "batch points"]]:
-        """Truth and labels under that declared symmetry which costs an object's prediction least."""
+        self, outputs: RootOutput, batch: Any, view: Rotations
+    ) -> tuple[ArticulatedPose, Array, Terms]:
+        """Truth, labels and losses under that declared symmetry which costs an object least."""
 
-        def cost(truth: ArticulatedPose) -> Array:
-            return stage1_loss(outputs, self._root_targets(truth), self.config)["total"]
+        def candidate(pose: ArticulatedPose, labels: Array):
+            truth = self._truth(pose, view)
+            terms = stage1_loss(outputs, self._root_targets(truth), self.config)
+            return terms.pop("total"), (truth, labels, terms)
 
-        truth, labels = self._truth(batch.pose, view), batch.labels
+        cost, best = candidate(batch.pose, batch.labels)
         for symmetry in self.category.symmetries:
-            other = self._truth(apply_symmetry(batch.pose, symmetry, self.category), view)
-            better = (cost(other) < cost(truth)) & is_ambiguous(batch.pose.size, symmetry)
-            candidate = other, permute_labels(batch.labels, symmetry)
-            truth, labels = where_samples(better, candidate, (truth, labels))
-        return truth, labels
+            pose = apply_symmetry(batch.pose, symmetry, self.category)
+            other_cost, other = candidate(pose, permute_labels(batch.labels, symmetry))
+            better = (other_cost < cost) & is_ambiguous(batch.pose.size, symmetry)
+            cost, best = where_samples(better, (other_cost, other), (cost, best))
+        return best
 
-    def _root_rotation(self, outputs: RootOutput) -> Float[Array, "batch 3 3"]:
+    def _root_rotation(self, outputs: RootOutput) -> Rotations:
         """By vertical correction of the predicted directions (Eq 3)."""
         rotation, _ = rotation_from_directions(
             outputs.directions[:, 0],
@@ -357,10 +363,10 @@ class Objective:
     def _reference_pose(
         self,
         key: Array,
-        predicted: Float[Array, "batch 3 3"],
+        predicted: Rotations,
         predicted_translation: Float[Array, "batch 3"],
         truth: ArticulatedPose,
-    ) -> tuple[Float[Array, "batch 4 4"], Int[Array, " batch"]]:
+    ) -> tuple[Poses, Classes]:
         """The pose that canonicalizes stage II's cloud: noise on the truth, or the prediction.
 
         The noise stands for the motion since a keyframe (the proxy canonical space of Sec 5.3.1).
@@ -395,7 +401,7 @@ class Objective:
         points: Float[Array, "batch points 3"],
         labels: Int[Array, "batch points"],
         truth: ArticulatedPose,
-        reference: Float[Array, "batch 4 4"],
+        reference: Poses,
     ) -> PartsTargets:
         offset = losses.axis_offsets(points, truth.joint_axis, truth.joint_pivot)
         distance = jnp.sqrt((offset * offset).sum(-1))
@@ -460,10 +466,10 @@ jax.tree_util.register_dataclass(
 
 def rotate_references(
     key: Array,
-    reference: Float[Array, "batch 4 4"],
-    rotation_class: Int[Array, " batch"],
+    reference: Poses,
+    rotation_class: Classes,
     rate: Any,
-) -> tuple[Float[Array, "batch 4 4"], Int[Array, " batch"]]:
+) -> tuple[Poses, Classes]:
     """Rotates some references by cube rotations, half of them by half turns.
 
     Args:

@@ -103,18 +103,8 @@ def _plain(value: Any) -> Any:
 
 def _differences(different: list[str], saved: dict[str, Any], now: dict[str, Any]) -> str:
     """What differs, for a message; the model that a run started from in a word."""
-    parts = []
-    start = f"{STARTED_FROM}."
-    settings = [key for key in different if not key.startswith(start)]
-    if len(settings) < len(different):
-        begun = [any(key.startswith(start) for key in keys) for keys in (saved, now)]
-        parts.append(
-            {
-                (True, True): "it started from another model",
-                (True, False): "it started from a model and this one from random weights",
-                (False, True): "it started from random weights and this one from a model",
-            }[begun[0], begun[1]]
-        )
+    settings = [key for key in different if not key.startswith(f"{STARTED_FROM}.")]
+    parts = ["it started from other weights"] if len(settings) < len(different) else []
     for key in settings[:_MAX_NAMED]:
         parts.append(f"{key} ({saved.get(key, _ABSENT)!r} there, {now.get(key, _ABSENT)!r} now)")
     if len(settings) > _MAX_NAMED:

@@ -251,7 +251,7 @@ def test_another_configuration_is_refused_by_key(tmp_path, unkilled):
         CaperError, match=r"setting0 \('absent' there, 0 now\), .*, 12 settings more;"
     ):
         resume(config(), many)
-    with pytest.raises(CaperError, match=r"started from random weights and this one from a model;"):
+    with pytest.raises(CaperError, match="it started from other weights"):
         resume(config(), {"initial": {"steps": 3, "run": many}})
     free = config(checkpoint_minutes=1.0, checkpoint_steps=7, keep_checkpoints=1)
     assert_same_bits(resume(free).state.params, unkilled.state.params)
@@ -285,10 +285,10 @@ def test_the_model_a_run_started_from_is_told_in_a_word(tmp_path):
     start = {"initial": {"steps": 3, "run": {"seed": 0}}}
     check_configuration(tmp_path, {"seed": 1, **start})
     check_configuration(tmp_path, {"seed": 1, **start})
-    with pytest.raises(CaperError, match=r"configuration: it started from a model and this one fr"):
+    with pytest.raises(CaperError, match="it started from other weights"):
         check_configuration(tmp_path, {"seed": 1})
     other = {"seed": 2, "initial": {"steps": 4, "run": {"seed": 0}}}
-    with pytest.raises(CaperError, match=r"it started from another model, seed \(1 there, 2 now\)"):
+    with pytest.raises(CaperError, match=r"it started from other weights, seed \(1 there, 2 now\)"):
         check_configuration(tmp_path, other)
 
 

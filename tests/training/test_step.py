@@ -11,8 +11,8 @@ from _helpers.objectives import BOX, DEEP, THIN, frames
 from _helpers.quick import quick_jit
 from _helpers.tiny import network, random_variables
 
-import caper_jax as caper
 from caper_jax.config import LossConfig, LossWeights
+from caper_jax.training.objective import Objective
 from caper_jax.training.optimizer import Optimizer
 from caper_jax.training.step import TrainState, step_keys, train_step
 
@@ -108,16 +108,16 @@ def test_nesting_in_a_function_of_ones_own():
 
 
 def test_variants_of_the_objective_train_side_by_side():
-    """Seeds, loss weights and learning rates at once, by the public names."""
+    """Seeds, loss weights and learning rates at once."""
     sizes, cloud = network(pool_first=True), frames(BOX, [THIN, DEEP])
     variables = random_variables(BOX, sizes)
 
     def one(seed, twist, rate):
         weights = LossWeights(twist=twist)
-        objective = caper.Objective(BOX, sizes, LossConfig(weights=weights, root_noise_deg=twist))
-        optimizer = caper.Optimizer("adamw", rate)
-        state = caper.TrainState.create(variables, optimizer, seed)
-        return caper.train_step(state, cloud, loss_fn=objective, optimizer=optimizer)
+        objective = Objective(BOX, sizes, LossConfig(weights=weights, root_noise_deg=twist))
+        optimizer = Optimizer("adamw", rate)
+        state = TrainState.create(variables, optimizer, seed)
+        return train_step(state, cloud, loss_fn=objective, optimizer=optimizer)
 
     seeds, twists, rates = SEEDS[:2], jnp.array([1.0, 5.0]), jnp.array([1e-3, 1e-2])
     states, metrics = quick_jit(jax.vmap(one))(seeds, twists, rates)
