@@ -49,7 +49,7 @@ def value_and_grad(loss_fn: Callable[..., Any], has_aux: bool = True) -> Callabl
         del progress
         (first, result), root = stage1(params["root"], model_state, batch, key)
         # Known once the gradient is; NaN or inf if that is not finite.
-        done = sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(root))
+        done = jnp.asarray(sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(root)))
         result = stop_gradient(result)
         result = result.replace(points=after(done, result.points))
         (second, rest), parts = stage2(params["parts"], model_state, result, key)

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 from flax.traverse_util import flatten_dict
 
-from caper_jax.config import RunConfig
+from caper_jax.config import RunConfig, to_dict
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
 
@@ -97,8 +97,7 @@ def _with_defaults(stored: dict[str, Any], given: dict[str, Any], kind: type) ->
 
 def _plain(value: Any) -> Any:
     """A default as JSON has it."""
-    value = dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value  # type: ignore[arg-type]
-    return json.loads(json.dumps(value))
+    return to_dict(value) if dataclasses.is_dataclass(value) else json.loads(json.dumps(value))
 
 
 def _differences(different: list[str], saved: dict[str, Any], now: dict[str, Any]) -> str:

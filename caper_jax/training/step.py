@@ -181,8 +181,9 @@ def compile_step(
     def gradient(loss_fn: LossFn, has_aux: bool = True) -> Callable[..., Any]:
         transform = memory.value_and_grad if save_memory else jax.value_and_grad
         function = transform(loss_fn, has_aux=has_aux)
-        local = mesh is not None and batch_norm == "local"
-        return parallel.each_device(function, mesh) if local else function
+        if mesh is None or batch_norm == "global":
+            return function
+        return parallel.each_device(function, mesh)
 
     def one(state: TrainState, progress: jax.Array, factor: jax.Array, data: PyTree):
         batch = data
@@ -191,8 +192,15 @@ def compile_step(
             batch = batch_fn(key) if data is None else batch_fn(key, data)
         if mesh is not None:
             batch = parallel.constrain_batch(batch, mesh)
-        options = {"loss_fn": loss_fn, "optimizer": optimizer, "value_and_grad": gradient}
-        return train_step(state, batch, progress, factor, **options)
+        return train_step(
+            state,
+            batch,
+            progress,
+            factor,
+            loss_fn=loss_fn,
+            optimizer=optimizer,
+            value_and_grad=gradient,
+        )
 
     def run(state: TrainState, progress: jax.Array, factor: jax.Array, data: PyTree = None):
         if progress.shape[0] == 1:  # no loop: XLA for CPU runs less of a loop's body in parallel
