@@ -113,7 +113,7 @@ def _paper(name: str, batch: int, repeats: int, rounded: bool) -> dict[str, Any]
     from benchmarks.models import clouds, random_estimator
     from caper_jax import categories
     from caper_jax.config import preset
-    from caper_jax.models.networks import RootNetwork
+    from caper_jax.models.root import RootNetwork
 
     category, network = categories.get(name), preset("paper")
     estimator = random_estimator(category, network)

@@ -117,6 +117,7 @@ def training(encoder: str) -> dict[str, np.ndarray]:
 
 
 def exported(category: str) -> dict[str, np.ndarray]:
+    old_name = {"points_per_part": "seen"}
     with tempfile.TemporaryDirectory() as folder:
         export_estimator(caper.load(category), folder, platforms=("cpu",))
         spec = importlib.util.spec_from_file_location("run", Path(folder) / "run.py")
@@ -125,7 +126,10 @@ def exported(category: str) -> dict[str, np.ndarray]:
         spec.loader.exec_module(runner)
         cloud = runner.sample(demo_cloud(DEMO / f"{category}_0"))
         found = runner.estimate(cloud[None])
-    return {f"{i:02d}": np.asarray(array) for i, array in enumerate(found.values())}
+    # In the order of the record, which had the joints in the rest frame only.
+    found = {old_name.get(name, name): array for name, array in found.items()}
+    names = sorted(name for name in found if not name.endswith("_camera"))
+    return {f"{i:02d}": np.asarray(found[name]) for i, name in enumerate(names)}
 
 
 CASES = {

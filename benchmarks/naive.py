@@ -15,7 +15,7 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 
-from caper_jax.models import networks as caper
+from caper_jax.models import encoders
 from caper_jax.models.encoders import hs as hs_encoder
 from caper_jax.models.encoders.features import Features, Level
 from caper_jax.models.encoders.neighbors import gather, squared_distances
@@ -62,6 +62,6 @@ def formulation() -> Iterator[None]:
     }
     with (
         mock.patch.multiple(hs_encoder, **reductions),
-        mock.patch.object(caper, "HSEncoder", Encoder),
+        mock.patch.dict(encoders.ENCODERS, {"hs": Encoder}),
     ):
         yield

@@ -96,9 +96,11 @@ def _calls(name: str) -> tuple[Any, dict[str, Callable[[], Any]], dict[str, Call
     from caper_jax.data.clouds import sample_points
     from caper_jax.estimator import estimate, load
     from caper_jax.geometry.frames import rotate, view_rotation
-    from caper_jax.models.networks import PartsNetwork, RootNetwork, make_encoder
+    from caper_jax.models.encoders import make_encoder
+    from caper_jax.models.parts import PartsNetwork
+    from caper_jax.models.root import RootNetwork
     from caper_jax.tracker import Tracker, config_for
-    from caper_jax.tracking.energy import chamfer_energy
+    from caper_jax.tracking.keyframes import chamfer_energy
     from caper_jax.tracking.measurement import measure
 
     estimator = load(name)

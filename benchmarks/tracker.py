@@ -86,7 +86,7 @@ def _measure(name: str, weights: Path | None, repeats: int) -> dict[str, Any]:
             for frame in range(1, FRAMES):
                 points = batch.points[video, frame]
                 seconds, result = timed(tracker, points)
-                (keyframes if result.estimated else steps).append(seconds)
+                (keyframes if result.estimator_queried else steps).append(seconds)
                 estimates.append(timed(estimator, points)[0])
     step, estimate = statistics.median(steps + keyframes), statistics.median(estimates)
     return {

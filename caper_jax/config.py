@@ -154,7 +154,7 @@ class NetworkConfig:
     """Both stages; the same sizes for each, separate weights.
 
     Attributes:
-      encoder: which encoder; the sizes of the other one are not used.
+      encoder: "hs", "fast", or the name of a registered one (``models.encoders.register``).
       hs: sizes of the HS-Encoder.
       fast: sizes of the fast encoder.
       root_heads: decoders of stage I.
@@ -177,7 +177,7 @@ class NetworkConfig:
         points alike, so this costs gradients, not coverage.
     """
 
-    encoder: Literal["hs", "fast"] = "fast"
+    encoder: str = "fast"
     hs: HSEncoderConfig = HSEncoderConfig()
     fast: FastEncoderConfig = FastEncoderConfig()
     root_heads: HeadConfig = HeadConfig()

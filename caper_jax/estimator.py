@@ -12,62 +12,72 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Int, Shaped
 
 from caper_jax import categories
 from caper_jax.articulation.category import Category
-from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.articulation.pose import Array, ArticulatedPose, joints_in_camera
 from caper_jax.config import NetworkConfig, from_dict
 from caper_jax.data.clouds import MIN_POINTS, are_sampled, sample_points
 from caper_jax.errors import CaperError
 from caper_jax.geometry.frames import rotate, view_rotation
 from caper_jax.models import uncertainty
 from caper_jax.models.files import CARD_FILE, flatten, read_model
-from caper_jax.models.networks import PartsNetwork, RootNetwork
-from caper_jax.models.pipeline import articulated_pose, read, refinements
+from caper_jax.models.parts import PartsNetwork
+from caper_jax.models.pipeline import articulated_pose, refinements, run_stages
 from caper_jax.models.refiner import BoxRefiner, num_features
+from caper_jax.models.root import RootNetwork
 from caper_jax.models.uncertainty import Calibration
 
 
 @flax.struct.dataclass
 class Prediction:
-    """What the estimator finds; leading axes [...] are those of its input.
+    """Result of the estimator; leading axes ``*batch`` are those of its input.
 
     Attributes:
-      pose: ArticulatedPose in the camera frame, meters.
-      points: [..., M, 3] the points the networks saw: the input itself when it has as many points
-        as they take, else an even pick of it.
-      labels: [..., M] int32 part of each of ``points``.
-      confidence: [..., 2] of the root's two directions, in (0, 1) (Sec 5.1.1).
-      degenerate: [...] bool, the two directions were parallel or zero: the rotation is arbitrary.
-      seen: [..., K] int32 how many of ``points`` show each part; one with fewer than
+      pose: poses and boxes of the parts, and the joints; camera frame, meters. Joint axes and
+        pivots are in the root's rest frame: see ``joints_in_camera``.
+      points: what the networks were given, camera frame, meters: the input itself when it has as
+        many points as they take, else points picked evenly from it.
+      labels: part of each of ``points``, int32.
+      confidence: of the root's two directions, in (0, 1) (Sec 5.1.1).
+      degenerate: the two directions were parallel or zero, so that the rotation is arbitrary.
+      points_per_part: how many of ``points`` show each part, int32; a part with fewer than
         ``uncertainty.HIDDEN_POINTS`` is hidden, and known through its joints alone.
-      evidence: [..., K, 6] see ``uncertainty.evidence``.
-      rotation_std, translation_std: [..., K] standard deviations about and along each axis, radians
-        and meters; the truth lies within 2.5 of them nine times in ten. None, as is the next, where
-        the model is not calibrated. See ``uncertainty.pose_covariance``.
-      state_std: [..., J] radians or meters; nine in ten within 1.64.
+      evidence: what the standard deviations follow from, see ``uncertainty.evidence``.
+      rotation_std, translation_std: standard deviations about and along each axis of the camera,
+        radians and meters; the truth lies within 2.5 of them nine times in ten. None, as is the
+        next, where the model is not calibrated. See ``uncertainty.pose_covariance``.
+      state_std: radians or meters; the truth lies within 1.64 of them nine times in ten.
     """
 
     pose: ArticulatedPose
-    points: Any
-    labels: Any
-    confidence: Any
-    degenerate: Any
-    seen: Any
-    evidence: Any
-    rotation_std: Any = None
-    translation_std: Any = None
-    state_std: Any = None
+    points: Float[Array, "*batch M 3"]
+    labels: Int[Array, "*batch M"]
+    confidence: Float[Array, "*batch 2"]
+    degenerate: Bool[Array, "*batch"]
+    points_per_part: Int[Array, "*batch K"]
+    evidence: Float[Array, "*batch K E"]
+    rotation_std: Float[Array, "*batch K"] = None
+    translation_std: Float[Array, "*batch K"] = None
+    state_std: Float[Array, "*batch J"] = None
+
+    def joints_in_camera(
+        self,
+    ) -> tuple[Float[Array, "*batch J 3"], Float[Array, "*batch J 3"]]:
+        """Joint axes (unit vectors) and pivots (meters) in the camera frame."""
+        return joints_in_camera(self.pose)
 
 
 def estimate(
     variables: dict[str, Any],
-    points,
+    points: Shaped[ArrayLike, "..."],
     category: Category,
     network: NetworkConfig,
     calibration: Calibration | None = None,
 ) -> Prediction:
-    """The pure function under the estimator: jit, vmap and differentiate it at will.
+    """The pure function under ``Estimator``: jit, vmap and differentiate it at will.
 
     Differentiable with respect to ``variables`` and ``points`` (labels and the choice of
     neighbors are not). vmap over stacked variables runs several models on one cloud.
@@ -95,31 +105,34 @@ def estimate(
     points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
     view = view_rotation(points, category.viewpoint.camera_roll)
     cloud = rotate(view, points) * category.unit
-    found = read(variables, cloud, category, network)
-    reading = refinements(variables, found, cloud, category, network)[-1]
-    labels = found.segmentation.argmax(-1).astype(jnp.int32)
+    outputs = run_stages(variables, cloud, category, network)
+    refined = refinements(variables, outputs, cloud, category, network)[-1]
+    labels = outputs.segmentation.argmax(-1).astype(jnp.int32)
     prediction = Prediction(
-        pose=articulated_pose(reading, view, category),
+        pose=articulated_pose(refined, view, category),
         points=points,
         labels=labels,
-        confidence=found.confidence,
-        degenerate=found.degenerate,
-        seen=uncertainty.points_of_parts(labels, category.num_parts),
-        evidence=found.evidence,
+        confidence=outputs.confidence,
+        degenerate=outputs.degenerate,
+        points_per_part=uncertainty.points_per_part(labels, category.num_parts),
+        evidence=outputs.evidence,
     )
     if calibration is None:
         return prediction
-    turn, shift, off = uncertainty.radii(calibration, found.evidence)
-    state_units = jnp.asarray(category.state_units, off.dtype)
+    rotation, translation, state = uncertainty.radii(calibration, outputs.evidence)
+    state_units = jnp.asarray(category.state_units, state.dtype)
     return prediction.replace(  # type: ignore[attr-defined]
-        rotation_std=turn / uncertainty.RADIUS_3D,
-        translation_std=shift / uncertainty.RADIUS_3D / category.unit,
-        state_std=off / uncertainty.RADIUS_1D / state_units,
+        rotation_std=rotation / uncertainty.RADIUS_3D,
+        translation_std=translation / uncertainty.RADIUS_3D / category.unit,
+        state_std=state / uncertainty.RADIUS_1D / state_units,
     )
 
 
 class Estimator:
-    """A trained model of one category.
+    """A trained model of one category, for clouds on the host.
+
+    Within jit, vmap or grad call the pure ``estimate``, or ``function``, which is ``estimate`` with
+    the category, the network and the calibration of this model.
 
     Attributes:
       category: its definition.
@@ -127,6 +140,7 @@ class Estimator:
       variables: weights, as ``estimate`` takes them.
       card: what the model was trained on, where and for how long.
       calibration: what its standard deviations follow from, if the card has it.
+      function: ``(variables, points [B, N, 3]) -> Prediction``, pure.
     """
 
     def __init__(
@@ -150,13 +164,13 @@ class Estimator:
         )
         self._jitted = jax.jit(self.function)
 
-    def __call__(self, points) -> Prediction:
+    def __call__(self, points: Any) -> Prediction:
         """Estimates one cloud or a batch.
 
-        Outside of transformations any number of points is taken: clouds are sampled to what the
-        networks see, so that a varying number never recompiles, and points that are NaN, infinite,
-        exactly zero or beyond 50 m are left out. Inside jit, grad or vmap the array goes through
-        unchanged.
+        Any number of points is taken: clouds are sampled to what the networks see, so that a
+        varying number never recompiles, and points that are NaN, infinite, exactly zero or beyond
+        50 m are left out. Arrays traced by jit, grad or vmap cannot be sampled and go to
+        ``function`` as they are.
 
         Args:
           points: [N, 3] or [B, N, 3] meters, camera frame (OpenCV), in any order.
@@ -177,8 +191,8 @@ class Estimator:
             return prediction
         return jax.tree.map(lambda array: array[0], prediction)
 
-    def sampled(self, points) -> np.ndarray:
-        """What the networks are given of points as ``__call__`` takes them, on the host.
+    def sampled(self, points: Any) -> Float[np.ndarray, "B N 3"]:
+        """The points that the networks are given for what ``__call__`` takes, on the host.
 
         Returns:
           [B, num_points, 3] float32.
@@ -226,7 +240,7 @@ def shipped_weights() -> Path:
 
 
 def load(
-    category: str,
+    category: str | Category,
     weights: str | Path | None = None,
     object_scale: float = 1.0,
     camera_roll: float = 0.0,
@@ -234,12 +248,13 @@ def load(
     """The estimator of a category.
 
     Args:
-      category: e.g. "box", or "FILE.py:NAME" (see ``categories.get``).
+      category: the category itself, its name (e.g. "box"), or "FILE.py:NAME" (see
+        ``categories.get``).
       weights: a model directory (weights.npz, model.json) as training writes it; by default the
         one that ships with the package.
       object_scale: how many times as large the objects are as those the model was trained on; the
         shipped models know real sizes, PartNet's objects in PM-Videos and ArtImage are larger.
-      camera_roll: degrees by which things that stand upright are turned clockwise in the image, 180
+      camera_roll: degrees by which upright things appear rotated clockwise in the image, 180
         for a camera upside down; the shipped models know level cameras, within 15 deg.
 
     Raises:
@@ -252,7 +267,7 @@ def load(
       prediction.pose.rotation         # [B, 2, 3, 3]
     """
     definition = categories.get(category)
-    name = definition.name  # however it was spelled
+    name = definition.name  # however it was given
     directory = shipped_weights() / name if weights is None else Path(weights)
     if weights is None and not directory.is_dir():
         shipped = sorted(path.name for path in shipped_weights().glob("*/"))

@@ -1,14 +1,15 @@
-"""Serving without this package: a model as StableHLO, weights inside, for several platforms.
+"""Serving without this package: a model of ``jax.export``, weights inside, for several platforms.
 
-The files are ``model.stablehlo`` (a portable artifact of StableHLO, as ``jax.export`` lowers it),
-``manifest.json`` and ``run.py``, which needs jax and numpy alone. The container that
-``jax.export`` would serialize is not used, as reading it takes a further package, flatbuffers.
+The files are ``model.jax_export`` (what ``jax.export`` serializes: StableHLO in a flatbuffer),
+``manifest.json``, which says shape, unit and frame of every input and output, and ``run.py``, which
+needs jax, numpy and flatbuffers.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,15 @@ from jax import export
 
 from caper_jax._version import __version__
 from caper_jax.articulation.category import Category
+from caper_jax.articulation.pose import joints_in_camera
 from caper_jax.data.clouds import FARTHEST_M, MIN_POINTS
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.estimator import Estimator, Prediction
 from caper_jax.files import write_atomically
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
-MODEL_FILE, MANIFEST_FILE, RUNNER_FILE = "model.stablehlo", "manifest.json", "run.py"
-FORMAT = 1  # of the manifest
-FRAME = "camera, OpenCV: x right, y down, z forward"
+MODEL_FILE, MANIFEST_FILE, RUNNER_FILE = "model.jax_export", "manifest.json", "run.py"
+FORMAT = 2  # of the manifest
 ANY_BATCH = "batch"  # stands for the size in shapes that leave it open
 
 _SAMPLING = (
@@ -36,25 +37,43 @@ _SAMPLING = (
     "row by columns, and take those at floor((i + 0.5) n / num_points), i = 0 .. num_points - 1; "
     "the order of the points taken does not matter"
 )
-# Output -> (unit, meaning). K parts and J joints in the manifest's order; part 0 is the root.
+# Frames of the manifest; "" where a quantity has none.
+_CAMERA, _PART, _ROOT, _NONE = "camera", "part_rest", "root_rest", ""
+_FRAMES = {
+    _CAMERA: "OpenCV: x right, y down, z forward",
+    _PART: "of each part; in the object's rest pose it is the root's",
+    _ROOT: "of the root in the object's rest pose; its origin is the center of the object's box",
+}
+# Output -> (unit, frame, meaning). K parts and J joints as the manifest lists them, the root first.
 _OUTPUTS = {
     "rotation": (
         "1",
+        _CAMERA,
         "[B, K, 3, 3] from the part's rest frame: p_camera = rotation p + translation",
     ),
-    "translation": ("meters", "[B, K, 3] see rotation"),
-    "size": ("meters", "[B, K, 3] extents of the part's box in its rest frame"),
-    "box_center": ("meters", "[B, K, 3] center of that box in the rest frame"),
-    "joint_axis": ("1", "[B, J, 3] unit vectors in the root's rest frame; positive states open"),
-    "joint_pivot": ("meters", "[B, J, 3] a point on the axis, in the root's rest frame"),
-    "joint_state": ("state", "[B, J] from the rest pose"),
-    "labels": ("1", "[B, num_points] part of each point"),
-    "confidence": ("1", "[B, 2] of the two directions that give the root's rotation, in (0, 1)"),
-    "degenerate": ("1", "[B] whether the rotation is arbitrary, as those directions were parallel"),
-    "seen": ("1", "[B, K] how many of the points show each part"),
-    "rotation_std": ("radians", "[B, K] standard deviation about each axis"),
-    "translation_std": ("meters", "[B, K] standard deviation along each axis"),
-    "state_std": ("state", "[B, J] standard deviation"),
+    "translation": ("meters", _CAMERA, "[B, K, 3] see rotation"),
+    "size": ("meters", _PART, "[B, K, 3] full extents of the part's box"),
+    "box_center": ("meters", _PART, "[B, K, 3] center of that box"),
+    "joint_axis": ("1", _ROOT, "[B, J, 3] unit vectors; positive states open"),
+    "joint_pivot": ("meters", _ROOT, "[B, J, 3] a point on the axis"),
+    "joint_axis_camera": ("1", _CAMERA, "[B, J, 3] unit vectors where the joints are now"),
+    "joint_pivot_camera": ("meters", _CAMERA, "[B, J, 3] a point on that axis"),
+    "joint_state": ("state", _NONE, "[B, J] from the rest pose"),
+    "labels": ("1", _NONE, "[B, num_points] part of each point"),
+    "confidence": (
+        "1",
+        _NONE,
+        "[B, 2] of the two directions that give the root's rotation, in (0, 1)",
+    ),
+    "degenerate": (
+        "1",
+        _NONE,
+        "[B] whether the rotation is arbitrary, as those directions were parallel",
+    ),
+    "points_per_part": ("1", _NONE, "[B, K] how many of the points show each part"),
+    "rotation_std": ("radians", _CAMERA, "[B, K] standard deviation about each axis"),
+    "translation_std": ("meters", _CAMERA, "[B, K] standard deviation along each axis"),
+    "state_std": ("state", _NONE, "[B, J] standard deviation"),
 }
 _CARD = (
     *("version", "commit", "hardware", "steps", "samples", "samples_in_all"),
@@ -63,15 +82,18 @@ _CARD = (
 
 
 def flat(prediction: Prediction) -> dict[str, Any]:
-    """What an exported model gives: the arrays of a prediction by name, those that it has.
+    """The outputs of an exported model: the arrays of a prediction by name, those that it has.
 
     Args:
       prediction: with any leading axes.
 
     Returns:
-      The fields of ``ArticulatedPose`` and of ``Prediction``, but for points and evidence.
+      The fields of ``ArticulatedPose`` and of ``Prediction``, but for points and evidence, and the
+      joints in the camera frame.
     """
+    axis, pivot = joints_in_camera(prediction.pose)
     arrays = {**vars(prediction.pose), **vars(prediction)}
+    arrays |= {"joint_axis_camera": axis, "joint_pivot_camera": pivot}
     return {name: arrays[name] for name in _OUTPUTS if arrays[name] is not None}
 
 
@@ -81,7 +103,7 @@ def export_estimator(
     platforms: Sequence[str] = ("cpu", "cuda"),
     batch: int | None = 1,
 ) -> dict[str, Any]:
-    """Writes an estimator as ``model.stablehlo``, ``manifest.json`` and ``run.py``.
+    """Writes an estimator as ``model.jax_export``, ``manifest.json`` and ``run.py``.
 
     The model takes points [B, num_points, 3], float32 meters in the camera frame, and gives a dict
     of arrays, see ``flat``. With a fixed batch it gives what ``estimator`` gives for a batch of
@@ -98,8 +120,10 @@ def export_estimator(
       The manifest.
 
     Raises:
-      CaperError: an unknown platform, none, or a batch below 1.
+      CaperError: an unknown platform, none, a batch below 1, or no flatbuffers.
     """
+    if find_spec("flatbuffers") is None:
+        raise CaperError("exporting needs flatbuffers: pip install 'caper-jax[export]'")
     platforms = tuple(dict.fromkeys(platforms))
     for platform in platforms:
         if platform not in PLATFORMS:
@@ -119,7 +143,7 @@ def export_estimator(
     directory.mkdir(parents=True, exist_ok=True)
     # The manifest goes first and comes last: it never stands beside files of another model.
     (directory / MANIFEST_FILE).unlink(missing_ok=True)
-    write_atomically(directory / MODEL_FILE, bytes(exported.mlir_module_serialized))
+    write_atomically(directory / MODEL_FILE, bytes(exported.serialize()))
     runner = Path(__file__).parent / "assets" / "serving" / RUNNER_FILE
     write_atomically(directory / RUNNER_FILE, runner.read_bytes())
     text = json.dumps(content, indent=2, allow_nan=False)
@@ -149,25 +173,27 @@ def _manifest(estimator: Estimator, exported: export.Exported) -> dict[str, Any]
         "category": category.name,
         "parts": _parts(category),
         "joints": _joints(category),
+        "model": MODEL_FILE,
         "platforms": list(exported.platforms),
+        "frames": _FRAMES,
         "inputs": {
             "points": {
                 **_array(points),
                 "unit": "meters",
-                "frame": FRAME,
+                "frame": _CAMERA,
                 "camera_roll_deg": category.viewpoint.camera_roll,  # see ``Category.rolled``
                 "sampling": _SAMPLING,
             }
         },
         "outputs": {
-            name: {**_array(outputs[name]), "unit": units.get(unit, unit), "meaning": meaning}
-            for name, (unit, meaning) in _OUTPUTS.items()
+            name: {
+                **_array(outputs[name]),
+                "unit": units.get(unit, unit),
+                "frame": frame,
+                "meaning": meaning,
+            }
+            for name, (unit, frame, meaning) in _OUTPUTS.items()
             if name in outputs
-        },
-        # Of the module, named as fields of jax.export.Exported.
-        "convention": {
-            "calling_convention_version": exported.calling_convention_version,
-            "uses_global_constants": exported.uses_global_constants,
         },
         "card": {name: card[name] for name in _CARD if name in card},
     }

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from caper_jax.articulation.category import Category
 from caper_jax.config import TrackerConfig, from_dict, override
 from caper_jax.data.clouds import FARTHEST_M, MIN_POINTS, as_cloud, is_measured, sample_points
 from caper_jax.errors import CaperError
@@ -182,7 +183,7 @@ def config_for(estimator: Estimator, *assignments: str) -> TrackerConfig:
 
 
 def load_tracker(
-    category: str,
+    category: str | Category,
     weights: str | Path | None = None,
     config: TrackerConfig | Sequence[str] = (),
     object_scale: float = 1.0,
@@ -191,7 +192,7 @@ def load_tracker(
     """The tracker of a category, with the weights that ``load`` takes.
 
     Args:
-      category: e.g. "box", or "FILE.py:NAME".
+      category: the category itself, its name (e.g. "box"), or "FILE.py:NAME".
       weights: a model directory; by default the one in the package.
       config: settings; or "key=value" changes to those that suit the model, see ``config_for``.
       object_scale, camera_roll: see ``estimator.load``.

@@ -1,4 +1,7 @@
-"""Tests run on the CPU, seen by JAX as eight devices; float64 only inside ``jax.enable_x64``."""
+"""Tests run on the CPU, seen by JAX as eight devices; float64 only inside ``jax.enable_x64``.
+
+Arrays are held to the shapes and dtypes that the package's annotations say (jaxtyping).
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,14 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 # Commands that tests run leave the cache of whoever runs the tests alone.
 os.environ["CAPER_CACHE"] = "off"
 
+import _helpers.typechecker
 import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
+from jaxtyping import install_import_hook
 
 jax.config.update("jax_num_cpu_devices", 8)
+install_import_hook("caper_jax", f"{_helpers.typechecker.__name__}.check")
 
 
 @pytest.fixture(scope="session", autouse=True)

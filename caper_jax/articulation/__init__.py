@@ -1,5 +1,5 @@
-"""Articulation: categories as data, poses, joints and forward kinematics."""
+"""Articulation: categories as data, poses, kinematics and symmetries."""
 
-from caper_jax.articulation import category, joints, kinematics, pose
+from caper_jax.articulation import category, kinematics, pose, symmetry
 
-__all__ = ["category", "joints", "kinematics", "pose"]
+__all__ = ["category", "kinematics", "pose", "symmetry"]

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from caper_jax.errors import CaperError, unknown_name
 from caper_jax.geometry.solids import Solid
 
 JointType = Literal["revolute", "prismatic"]
@@ -30,21 +31,21 @@ class Joint:
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A second, equally right reading of the same object (a declared ambiguity).
+    """Another pose that describes the same object equally well (a declared ambiguity).
 
-    The pose of part k reads ``T'_k = T_permutation[k] @ S`` with S the rotation ``turn`` about the
-    canonical origin.
+    There the pose of part k is ``T'_k = T_permutation[k] @ S``, with S the ``rotation`` about the
+    origin of the rest frame.
 
     Attributes:
-      permutation: part k of the second reading is part ``permutation[k]`` of the first.
-      turn: [3, 3] rotation of the canonical frame.
-      reason: for people.
+      permutation: part k is then what was part ``permutation[k]``.
+      rotation: [3, 3] of the rest frame.
+      reason: why the two cannot be told apart, for documentation.
       tolerance: largest relative difference of any extent of the exchanged parts at which an
-        instance still looks the same under both readings.
+        instance still looks the same in both poses.
     """
 
     permutation: tuple[int, ...]
-    turn: tuple[tuple[float, float, float], ...]
+    rotation: tuple[tuple[float, float, float], ...]
     reason: str
     tolerance: float = 0.3
 
@@ -75,7 +76,7 @@ class Viewpoint:
       azimuth: degrees, full circle by default; 0 looks at the front (+z).
       elevation: degrees above the table.
       roll: degrees, either side of ``camera_roll``.
-      camera_roll: degrees by which things that stand upright are turned clockwise in the image.
+      camera_roll: degrees by which upright things appear rotated clockwise in the image.
       distance: in object diagonals.
       either_side: the object lies on its one side as often as on the other, so that cameras above
         the table look at either.
@@ -152,8 +153,6 @@ class Category:
         Raises:
           CaperError: a factor that is not positive.
         """
-        from caper_jax.errors import CaperError
-
         if not 0 < factor < np.inf:
             raise CaperError(f"object scale must be positive, got {factor}")
         if factor == 1.0:
@@ -181,14 +180,12 @@ class Category:
         """The category as cameras see it that are not level; same networks, same weights.
 
         Args:
-          degrees: by which things are turned clockwise in the image, beyond what they were; 180
+          degrees: by which things appear rotated clockwise in the image, on top of before; 180
             for a camera upside down.
 
         Raises:
           CaperError: an angle that is not finite.
         """
-        from caper_jax.errors import CaperError
-
         if not np.isfinite(degrees):
             raise CaperError(f"camera roll must be finite, in degrees, got {degrees}")
         if degrees == 0.0:
@@ -197,8 +194,6 @@ class Category:
         return replace(self, viewpoint=replace(self.viewpoint, camera_roll=camera_roll))
 
     def __post_init__(self) -> None:
-        from caper_jax.errors import CaperError, unknown_name
-
         where = f"category {self.name!r}"
         if len(self.parts) != len(self.joints) + 1:
             raise CaperError(f"{where}: {len(self.parts)} parts need {len(self.parts) - 1} joints")
@@ -227,11 +222,15 @@ class Category:
         if self.closed not in ("low", "high", None):
             raise CaperError(f"{where}: closed is 'low', 'high' or None, got {self.closed!r}")
         for symmetry in self.symmetries:
-            turn = np.array(symmetry.turn, float)
+            rotation = np.array(symmetry.rotation, float)
             if sorted(symmetry.permutation) != list(range(len(self.parts))):
                 raise CaperError(
-                    f"{where}: an symmetry must permute the parts, got {symmetry.permutation}"
+                    f"{where}: a symmetry must permute the parts, got {symmetry.permutation}"
                 )
-            is_rotation = turn.shape == (3, 3) and np.allclose(turn @ turn.T, np.eye(3), atol=1e-5)
-            if not is_rotation or np.linalg.det(turn) < 0:
-                raise CaperError(f"{where}: the turn of an symmetry is not a rotation: {turn}")
+            is_rotation = rotation.shape == (3, 3) and np.allclose(
+                rotation @ rotation.T, np.eye(3), atol=1e-5
+            )
+            if not is_rotation or np.linalg.det(rotation) < 0:
+                raise CaperError(
+                    f"{where}: the rotation of a symmetry is no rotation matrix: {rotation}"
+                )

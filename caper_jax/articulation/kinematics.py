@@ -1,17 +1,104 @@
-"""Forward kinematics of a part tree."""
+"""Joint transforms and forward kinematics of a part tree (paper Sec 5.2.2, Eq 8).
+
+Eq 8 is implemented in its right form, ``[R | (I - R) q]``. A state is measured from the rest pose,
+in radians (revolute) or meters (prismatic). A positive one turns the child by plus the state about
+the axis, or slides it by plus the state along the axis. Axes are scaled to unit length here; a zero
+axis gives the identity, with finite derivatives.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
-from caper_jax.articulation.joints import joint_transforms
-from caper_jax.errors import CaperError
-from caper_jax.lie import se3
-from caper_jax.lie.linalg import as_floating
+from caper_jax.errors import CaperError, unknown_name
+from caper_jax.lie import se3, so3
+from caper_jax.lie.linalg import as_floating, cross, unit
+
+
+def revolute_transform(
+    axis: ArrayLike, pivot: ArrayLike, angle: ArrayLike
+) -> Float[Array, "... 4 4"]:
+    """Turn [..., 4, 4] about the line through ``pivot``.
+
+    R is Rodrigues' rotation about the unit axis u, ``cos I + (1 - cos) u u^T + sin hat(u)``.
+
+    Args:
+      axis: [..., 3] direction of the line.
+      pivot: [..., 3] meters; any point of the line.
+      angle: [...] radians.
+    """
+    return joint_transform("revolute", axis, pivot, angle)
+
+
+def prismatic_transform(axis: ArrayLike, displacement: ArrayLike) -> Float[Array, "... 4 4"]:
+    """Slide [..., 4, 4] along an axis: ``[I | d u]``.
+
+    Args:
+      axis: [..., 3] direction.
+      displacement: [...] meters.
+    """
+    u = unit(as_floating(axis, (3,), "axis"))
+    shift = u * as_floating(displacement, (), "displacement")[..., None]
+    return se3.from_rt(jnp.eye(3, dtype=shift.dtype), shift)
+
+
+def joint_transform(
+    joint_type: str, axis: ArrayLike, pivot: ArrayLike, state: ArrayLike
+) -> Float[Array, "... 4 4"]:
+    """Transform [..., 4, 4] of a joint at a state.
+
+    Args:
+      joint_type: "revolute" or "prismatic".
+      axis: [..., 3] in the root's canonical (rest) frame.
+      pivot: [..., 3] meters, same frame; without effect on a prismatic joint.
+      state: [...] radians or meters.
+
+    Raises:
+      CaperError: unknown joint type.
+    """
+    axis = as_floating(axis, (3,), "axis")[..., None, :]
+    pivot = as_floating(pivot, (3,), "pivot")[..., None, :]
+    state = as_floating(state, (), "state")[..., None]
+    return joint_transforms([joint_type], axis, pivot, state)[..., 0, :, :]
+
+
+def joint_transforms(
+    joint_types: Sequence[str], axis: ArrayLike, pivot: ArrayLike, state: ArrayLike
+) -> Float[Array, "... J 4 4"]:
+    """Transforms [..., J, 4, 4] of J joints, each at its own state.
+
+    Args:
+      joint_types: J times "revolute" or "prismatic".
+      axis: [..., J, 3] in the root's canonical (rest) frame.
+      pivot: [..., J, 3] meters, same frame; without effect on a prismatic joint.
+      state: [..., J] radians or meters.
+
+    Raises:
+      CaperError: unknown joint type.
+    """
+    known = ("revolute", "prismatic")
+    for name in joint_types:
+        if name not in known:
+            raise unknown_name("joint type", name, known)
+    turns = np.array([name == "revolute" for name in joint_types], dtype=bool)
+    count = len(turns)
+    u = unit(as_floating(axis, (count, 3), "axis"))
+    q = jnp.where(turns[:, None], as_floating(pivot, (count, 3), "pivot"), 0.0)
+    state = as_floating(state, (count,), "state")
+    angle, slide = jnp.where(turns, state, 0.0), jnp.where(turns, 0.0, state)
+
+    sin, versine = jnp.sin(angle), 2 * jnp.sin(angle / 2) ** 2
+    rotation = so3.rodrigues(u, sin, versine)
+    # (I - R) q from the same terms: small for small angles, where the difference q - R q would
+    # be left with the rounding of q.
+    turned = cross(u, q)
+    shift = slide[..., None] * u - sin[..., None] * turned - versine[..., None] * cross(u, turned)
+    return se3.from_rt(rotation, shift)
 
 
 def forward_kinematics(
@@ -21,7 +108,7 @@ def forward_kinematics(
     state: ArrayLike,
     joint_types: Sequence[str],
     parents: Sequence[int],
-) -> jax.Array:
+) -> Float[Array, "... K 4 4"]:
     """Poses of all K = J + 1 parts: ``T_k = T_parent(k) J_k(state_k)``.
 
     Axes and pivots are given in the root's canonical frame at rest. At rest every part shares the

@@ -1,10 +1,9 @@
 """The registry of categories; one module per category holds its definition.
 
 A category of your own needs no change to this package. Write a module that defines a ``Category``;
-tests/microwave.py in the repository is a whole one. From Python, pass the object itself to
-``Generator``, ``Objective`` or ``Estimator``, or ``register`` it once and use its name like any
-other.
-On the command line, spell it ``FILE.py:NAME`` or ``package.module:NAME``::
+tests/_helpers/microwave.py in the repository is a whole one. From Python, pass the object itself
+to ``load``, ``load_tracker``, ``Generator`` or ``train``, or ``register`` it once and use its name
+like any other. On the command line, spell it ``FILE.py:NAME`` or ``package.module:NAME``::
 
     caper generate --category microwave.py:MICROWAVE --frames 3 --images --out frames
     caper train --category microwave.py:MICROWAVE --minutes 30 --out runs/microwave
@@ -19,7 +18,8 @@ What a definition settles:
   frame, meters, y up (or ``viewpoint.up``), in the pose that is called rest, where every state is
   0; joint axes, pivots and limits in the same frame. A positive state opens.
 * ``directions``: the two axes of the root's frame that its shape shows best.
-* ``viewpoint`` and ``symmetries``: where cameras stand, and which readings are equally right.
+* ``viewpoint`` and ``symmetries``: where cameras stand, and which other poses describe the same
+  object.
 * ``unit``, network units per meter: 2 over the mean diagonal of the whole object.
 * ``mean_size`` and ``mean_center``: the means of ``size`` and ``box_center`` of
   ``build_bank(draw_instances(category, 1500, "train", 0))``.
@@ -27,8 +27,15 @@ What a definition settles:
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
+import sys
+import traceback
+import zlib
+from pathlib import Path
+from types import ModuleType
+
 from caper_jax.articulation.category import Category
-from caper_jax.categories import user_module
 from caper_jax.categories.box import BOX
 from caper_jax.categories.cutter import CUTTER
 from caper_jax.categories.dishwasher import DISHWASHER
@@ -52,12 +59,7 @@ def register(category: Category) -> Category:
       CaperError: another definition already has that name, or the definition holds lists or
         arrays where tuples belong (a category is a static argument of jitted functions).
     """
-    try:
-        hash(category)
-    except TypeError as error:
-        raise CaperError(
-            f"category {category.name!r}: use tuples, not lists or arrays, in it ({error})"
-        ) from error
+    _check_hashable(category)
     if _REGISTRY.get(category.name, category) is not category:
         raise CaperError(f"category {category.name!r} is already registered; choose another name")
     _REGISTRY[category.name] = category
@@ -78,27 +80,113 @@ def registered(name: str) -> Category:
       CaperError: unknown name; the message lists the known ones and the nearest.
     """
     if name not in _REGISTRY:
-        raise unknown_name("category", name, _REGISTRY)
+        raise CaperError(
+            f"{unknown_name('category', name, _REGISTRY)}; one of your own is FILE.py:NAME, "
+            "package.module:NAME, or registered by caper_jax.register"
+        )
     return _REGISTRY[name]
 
 
-def get(name: str) -> Category:
+def _check_hashable(category: Category) -> None:
+    try:
+        hash(category)
+    except TypeError as error:
+        raise CaperError(
+            f"category {category.name!r}: use tuples, not lists or arrays, in it ({error})"
+        ) from error
+
+
+def get(name: str | Category) -> Category:
     """The category of that name, or the one that a user's own module defines.
 
     Args:
       name: a registered name such as ``box``; or ``FILE.py:NAME`` or ``package.module:NAME``, which
-        imports the module and registers its category.
+        imports the module and registers its category; or a category itself, which need not be
+        registered.
 
     Raises:
       CaperError: unknown name (the message lists the known ones and the nearest); no such file,
         module or attribute; an attribute that is no Category; an exception while importing; or a
-        category whose name is already taken.
+        category whose name is already taken, or that is not hashable.
     """
+    if isinstance(name, Category):
+        _check_hashable(name)
+        return name
     if ":" in name:
-        return register(user_module.load(name))
+        return register(_load(name))
     if name.endswith(".py"):
         raise CaperError(f"category {name!r}: add which one it defines, {name}:NAME")
     return registered(name)
+
+
+def _load(name: str) -> Category:
+    """Imports a user's module, once per process, and takes a category from it.
+
+    Args:
+      name: ``FILE.py:NAME``, or ``package.module:NAME`` of a module that Python finds (installed,
+        or on PYTHONPATH).
+
+    Raises:
+      CaperError: no such file, module or attribute; an attribute that is no Category; an exception
+        while importing.
+    """
+    source, _, attribute = name.rpartition(":")
+    if not source or not attribute:
+        raise CaperError(f"category {name!r}: give FILE.py:NAME or package.module:NAME")
+    module = _from_file(Path(source)) if source.endswith(".py") else _from_name(source)
+    found = getattr(module, attribute, None)
+    if isinstance(found, Category):
+        return found
+    wrong = f"defines no {attribute!r}"
+    if hasattr(module, attribute):
+        wrong = f"defines {attribute} as {type(found).__name__}, not as a Category"
+    others = sorted(key for key, value in vars(module).items() if isinstance(value, Category))
+    raise CaperError(f"{source} {wrong} (categories in it: {', '.join(others) or 'none'})")
+
+
+def _from_file(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise CaperError(f"no file {path} to take a category from")
+    path = path.resolve()
+    # Not the file's own name, which might hide an installed module.
+    name = f"caper_jax_user_module_{zlib.crc32(str(path).encode()):08x}"
+    if name in sys.modules:
+        return sys.modules[name]
+    specification = importlib.util.spec_from_file_location(name, path)
+    assert specification is not None and specification.loader is not None  # it ends in .py
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[name] = module
+    try:
+        specification.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        del sys.modules[name]
+        raise _import_error(str(path), error) from error
+    return module
+
+
+def _from_name(name: str) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and f"{name}.".startswith(f"{error.name}."):
+            raise CaperError(
+                f"no module {error.name!r} to take a category from; install it, set PYTHONPATH, "
+                "or give the path of a file that ends in .py"
+            ) from error
+        raise _import_error(name, error) from error
+    except (Exception, SystemExit) as error:
+        raise _import_error(name, error) from error
+
+
+def _import_error(source: str, error: BaseException) -> CaperError:
+    """What a user's module raised, and where."""
+    trace = traceback.extract_tb(error.__traceback__)
+    frames = [frame for frame in trace if not frame.filename.startswith("<frozen")]
+    where = ""
+    # The message of a SyntaxError says the line itself; a file read by us comes after this one.
+    if frames[-1].filename != __file__:
+        where = f" ({frames[-1].filename}, line {frames[-1].lineno})"
+    return CaperError(f"{source}: importing it raised {type(error).__name__}: {error}{where}")
 
 
 for _category in (BOX, CUTTER, DISHWASHER, DRAWER, EYEGLASSES, LAPTOP, ROBOTARM, SCISSORS, STAPLER):

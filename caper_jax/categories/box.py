@@ -285,7 +285,7 @@ BOX = Category(
     symmetries=(
         Symmetry(
             permutation=(1, 0),
-            turn=((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
+            rotation=((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
             reason="a case whose lid is as deep as its base may exchange the two",
         ),
     ),

@@ -6,12 +6,11 @@ thumb moves with the blade and belongs to it.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
-from caper_jax.categories.cutter_plan import LONGEST, SHARE, TYPES, Plan, draw_plan
 from caper_jax.categories.forms import about, along, beam
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid
 
@@ -20,8 +19,91 @@ _TURN_X = about("y", np.pi / 2)  # cylinder z -> x
 _TURN_Y = about("x", -np.pi / 2)  # cylinder z -> y
 _UP = (0.0, 1.0, 0.0)
 
+_LONGEST = 0.115  # meters of extension that any instance allows
+_SHARE = 0.9  # of the slider's way that is used
 
-def _handle(rng: np.random.Generator, plan: Plan, name: str) -> list[Solid]:
+# Probability; length, width and height of the handle and width of the blade, meters. "wide" and
+# "slim" are those of the nine ReArt-48 cutters: handle 105-163 x 22-34 x 11-20 mm, blade with
+# carrier 78-134 x 12-22 mm, 71-97 mm of travel, slider up to 5 mm above the face.
+_TYPES = {
+    "slim": (0.27, (0.105, 0.15), (0.016, 0.026), (0.008, 0.015), (0.008, 0.013)),
+    "wide": (0.38, (0.13, 0.178), (0.025, 0.036), (0.011, 0.021), (0.016, 0.023)),
+    "utility": (0.2, (0.13, 0.175), (0.026, 0.042), (0.014, 0.026), (0.017, 0.02)),
+    "card": (0.08, (0.06, 0.095), (0.018, 0.034), (0.005, 0.01), (0.008, 0.018)),
+    "pen": (0.07, (0.12, 0.16), (0.01, 0.015), (0.009, 0.014), (0.006, 0.008)),
+}
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Measures in meters; the handle spans x in [0, length] and y in [-height / 2, height / 2].
+
+    Attributes:
+      length, width, height: of the handle.
+      back, front: x of the ends of its body; before and behind come its round end and its nose.
+      floor: y of the underside of the blade's channel.
+      gap: height of the channel.
+      blade: width of the blade.
+      aside: z of the middle of blade and slot.
+      slot: x of the slot's ends.
+      slot_width: its width.
+      slider: length of the slider.
+      edge: the slider runs on the narrow side (-z) instead of the flat face.
+    """
+
+    length: float
+    width: float
+    height: float
+    back: float
+    front: float
+    floor: float
+    gap: float
+    blade: float
+    aside: float
+    slot: tuple[float, float]
+    slot_width: float
+    slider: float
+    edge: bool
+
+
+def _draw_plan(rng: np.random.Generator, name: str) -> _Plan:
+    _, *ranges = _TYPES[name]
+    length, width, height, blade = (rng.uniform(*row) for row in ranges)
+    blade = min(blade, 0.8 * width)
+    slider = length * rng.uniform(0.09, 0.2)
+    edge = name == "utility" and rng.random() < 0.4
+    if name == "utility" and rng.random() < 0.5:
+        back = length * rng.uniform(0.25, 0.45)
+    else:
+        back = width / 2 * rng.uniform(0.3, 1.0) if rng.random() < 0.5 and name != "pen" else 0.0
+    # The slot, and with it the travel: long for snap-off blades, short for trapezoid ones.
+    share = rng.uniform(0.16, 0.34) if name in ("utility", "pen") else rng.uniform(0.46, 0.74)
+    way = min(share * length, 0.98 * _LONGEST / _SHARE)
+    ahead = rng.uniform(0.14, 0.3) if name in ("utility", "pen") else rng.uniform(0.05, 0.2)
+    end = length * (1 - ahead)
+    start = max(end - way - slider, back + 0.03 * length)
+    front = length
+    if name in ("utility", "pen") or rng.random() < 0.5:
+        front = end + (length - end) * rng.uniform(0.2, 0.6)
+    gap = min(rng.uniform(0.0012, 0.003), 0.25 * height)
+    return _Plan(
+        length=length,
+        width=width,
+        height=height,
+        back=back,
+        front=front,
+        floor=-height / 2 + rng.uniform(0.3, 0.6) * (height - gap),
+        gap=gap,
+        blade=blade,
+        aside=rng.uniform(-0.3, 0.3) * (width - blade) if rng.random() < 0.5 else 0.0,
+        slot=(start, end),
+        slot_width=min(rng.uniform(0.003, 0.009), 0.5 * blade),
+        slider=slider,
+        edge=edge,
+    )
+
+
+def _handle(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
     """Two shells with the channel of the blade between them, or one round body; and trimmings."""
     back, front = plan.back, plan.front
     middle, reach = (back + front) / 2, (front - back) / 2
@@ -77,7 +159,7 @@ def _taper(narrow: float, flat: float) -> tuple[float, float] | None:
     return None if narrow == flat == 1.0 else (min(narrow, 1.0), flat)
 
 
-def _slot(plan: Plan, middle: float, half: float) -> Solid:
+def _slot(plan: _Plan, middle: float, half: float) -> Solid:
     """What the slot takes from the upper shell: through its face, or into its narrow side."""
     top, high = plan.floor + plan.gap, plan.height / 2
     if plan.edge:
@@ -88,7 +170,7 @@ def _slot(plan: Plan, middle: float, half: float) -> Solid:
     return box(center, (half, depth / 2, plan.slot_width / 2))
 
 
-def _front(rng: np.random.Generator, plan: Plan, name: str) -> list[Solid]:
+def _front(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
     """From the end of the body to the mouth: a nose, or a sheet metal sleeve open at the top."""
     start, end = plan.front, plan.length
     middle, reach = (start + end) / 2, (end - start) / 2
@@ -122,7 +204,7 @@ def _front(rng: np.random.Generator, plan: Plan, name: str) -> list[Solid]:
     return [box(center, (reach + 0.002, (high - low) / 2, half), hole=open_)]
 
 
-def _back(rng: np.random.Generator, plan: Plan, name: str) -> list[Solid]:
+def _back(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
     """A round end, a cap, or a grip that bends away; perhaps a wheel, a lanyard hole, a clip."""
     half, thick = plan.width / 2, plan.height / 2
     solids = []
@@ -157,7 +239,7 @@ def _back(rng: np.random.Generator, plan: Plan, name: str) -> list[Solid]:
     return solids
 
 
-def _blade(rng: np.random.Generator, plan: Plan, name: str) -> list[Solid]:
+def _blade(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
     """The blade, its tip cut at an angle, and the carrier, neck and slider that move with it."""
     thick = min(rng.uniform(0.0004, 0.0009), 0.7 * plan.gap)
     level = plan.floor + plan.gap / 2
@@ -180,7 +262,7 @@ def _blade(rng: np.random.Generator, plan: Plan, name: str) -> list[Solid]:
     return solids + _slider(rng, plan, at)
 
 
-def _slider(rng: np.random.Generator, plan: Plan, at: float) -> list[Solid]:
+def _slider(rng: np.random.Generator, plan: _Plan, at: float) -> list[Solid]:
     """The neck through the slot and what the thumb pushes, around x = ``at``."""
     reach = plan.slider / 2
     rise = rng.uniform(0.0012, 0.0055)
@@ -227,11 +309,11 @@ def _slider(rng: np.random.Generator, plan: Plan, at: float) -> list[Solid]:
 
 def shape(rng: np.random.Generator) -> ObjectModel:
     """Draws one cutter; two in three have the proportions of the ReArt-48 ones."""
-    name = str(rng.choice(list(TYPES), p=[row[0] for row in TYPES.values()]))
-    plan = draw_plan(rng, name)
+    name = str(rng.choice(list(_TYPES), p=[row[0] for row in _TYPES.values()]))
+    plan = _draw_plan(rng, name)
     handle, blade = _handle(rng, plan, name), _blade(rng, plan, name)
     way = plan.slot[1] - plan.slot[0] - plan.slider - 0.001
-    limits = np.array([[0.0, min(SHARE * way, LONGEST)]])
+    limits = np.array([[0.0, min(_SHARE * way, _LONGEST)]])
     mouth = np.array([[plan.length, plan.floor + plan.gap / 2, plan.aside]])
     return ObjectModel([handle, blade], _TRAVEL, mouth, limits)
 
@@ -239,7 +321,7 @@ def shape(rng: np.random.Generator) -> ObjectModel:
 CUTTER = Category(
     name="cutter",
     parts=("body", "blade"),
-    joints=(Joint("prismatic", parent=0, limits=(0.0, LONGEST)),),
+    joints=(Joint("prismatic", parent=0, limits=(0.0, _LONGEST)),),
     directions=("x", "y"),
     directions_reason="the long way of the handle shows x, the slider and the flat face show y",
     unit=13.8,

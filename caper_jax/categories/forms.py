@@ -1,14 +1,17 @@
-"""Forms that several categories are made of: rotations, solids between two points, chains."""
+"""What several categories are made of: rotations, beams, chains, handles and stands.
+
+Meters, y up; handles sit on fronts that face +z.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from caper_jax.geometry.solids import Solid, box, cone, cylinder, frustum
+from caper_jax.geometry.solids import Solid, box, cone, cylinder, ellipsoid, frustum
 
 Axis = Literal["x", "y", "z"]
 
@@ -42,9 +45,9 @@ def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
     return x / length, y / length, z / length
 
 
-def turned(solid: Solid, rotation: np.ndarray, pivot=(0.0, 0.0, 0.0)) -> Solid:
-    """The solid (and its hole) turned by ``rotation`` [3, 3] about ``pivot`` [3]."""
-    hole = None if solid.hole is None else turned(solid.hole, rotation, pivot)
+def rotated(solid: Solid, rotation: np.ndarray, pivot=(0.0, 0.0, 0.0)) -> Solid:
+    """The solid (and its hole) rotated by ``rotation`` [3, 3] about ``pivot`` [3]."""
+    hole = None if solid.hole is None else rotated(solid.hole, rotation, pivot)
     center = rotation @ (solid.center - pivot) + pivot
     return replace(solid, center=center, rotation=rotation @ solid.rotation, hole=hole)
 
@@ -96,4 +99,155 @@ def chain(points, half, up, closed: bool = False, round_: bool = False) -> list[
         way = end - start
         reach = 0.35 * half[0] / math.sqrt(way @ way) * way
         solids.append(beam(start - reach, end + reach, half, up, None, round_))
+    return solids
+
+
+TURN_X = about("y", np.pi / 2)  # takes the axis of a cylinder from z to x
+TURN_Y = about("x", -np.pi / 2)  # and from z to y
+UPSIDE_DOWN = about("x", np.pi / 2)  # takes z to -y: tapers downwards
+
+HandleStyle = Literal["none", "rod", "staple", "knob", "ball", "cup", "lip", "tag"]
+
+
+@dataclass(frozen=True)
+class Handle:
+    """A handle, drawn once for an object and then mounted on each of its fronts.
+
+    Attributes:
+      style: "rod" is a round bar on two posts, "staple" a square one of one piece, "knob" a disc
+        on a stem, "ball" an ellipsoid, "cup" a shell to reach under, "lip" an edge as wide as the
+        front, "tag" a rod with a frame for a label above it.
+      share: length over the front's width.
+      reach: how far it stands out of the front.
+      half: half its thickness; of knobs the radius.
+      pair: two of it side by side on a front that is wide enough.
+      inset: the posts' distance from the ends of a rod, as a share of its length.
+    """
+
+    style: HandleStyle
+    share: float
+    reach: float
+    half: float
+    pair: bool = False
+    inset: float = 0.1
+
+    @staticmethod
+    def draw(rng: np.random.Generator, style: HandleStyle, scale: float, wide: bool) -> Handle:
+        """A handle of real size times ``scale`` (1 for furniture, less for desktop boxes).
+
+        On ``wide`` fronts knobs may come in pairs.
+        """
+        if style in ("knob", "ball"):
+            half, reach = rng.uniform(0.011, 0.021), rng.uniform(0.018, 0.034)
+        elif style == "cup":
+            half, reach = rng.uniform(0.013, 0.022), rng.uniform(0.015, 0.027)
+        else:
+            half, reach = rng.uniform(0.004, 0.009), rng.uniform(0.02, 0.048)
+        long = rng.random() < 0.35
+        return Handle(
+            style,
+            share=rng.uniform(0.5, 0.92) if long else rng.uniform(0.18, 0.5),
+            reach=scale * reach,
+            half=scale * half,
+            pair=wide and rng.random() < 0.5,
+            inset=rng.uniform(0.02, 0.14),
+        )
+
+    def on(self, center, width: float, height: float) -> list[Solid]:
+        """The solids, at most four and mostly one or two, on a front [width, height].
+
+        Args:
+          center: [3] where the handle's middle touches the front.
+        """
+        x, y, z = center
+        half = min(self.half, 0.4 * height)
+        if self.style == "none":
+            return []
+        if self.style == "lip":
+            half = min(half, 0.1 * height)
+            return [box((x, y, z + 0.35 * self.reach), (0.499 * width, half, 0.4 * self.reach))]
+        if self.style in ("rod", "staple", "tag"):
+            return self._bar((x, y, z), 0.5 * self.share * width, half, height)
+        spread = 0.27 * width
+        places = (x - spread, x + spread) if self.pair else (x,)
+        return [solid for place in places for solid in self._knob((place, y, z), half)]
+
+    def _bar(self, center, reach_x: float, half: float, height: float) -> list[Solid]:
+        x, y, z = center
+        out = self.reach
+        if self.style == "staple":
+            hole = box((x, y, z), (reach_x - 2 * half, 2 * half, out - 1.6 * half))
+            return [box((x, y, z + out / 2), (reach_x, half, out / 2), hole=hole)]
+        post = reach_x * (1 - 2 * self.inset) - half
+        solids = [cylinder((x, y, z + out - half), (half, half, reach_x), TURN_X)]
+        for side in (-1, 1):
+            place = (x + side * post, y, z + (out - half) / 2)
+            solids.append(box(place, (0.8 * half, 0.8 * half, (out - half) / 2)))
+        if self.style == "tag":
+            rise = min(0.028, 0.22 * height)
+            solids.append(box((x, y + 1.5 * rise, z), (0.6 * reach_x, 0.5 * rise, half / 2)))
+        return solids
+
+    def _knob(self, center, half: float) -> list[Solid]:
+        x, y, z = center
+        out = self.reach
+        if self.style == "cup":
+            wide = 2.6 * half
+            return [ellipsoid((x, y, z + 0.35 * out), (wide, half, 0.65 * out))]
+        if self.pair:  # of one piece each
+            extents = (half, half, out / 2)
+            return [
+                (cylinder if self.style == "knob" else ellipsoid)((x, y, z + 0.4 * out), extents)
+            ]
+        stem = cylinder((x, y, z + 0.4 * out), (0.45 * half, 0.45 * half, 0.4 * out))
+        if self.style == "knob":
+            return [stem, cylinder((x, y, z + 0.82 * out), (half, half, 0.18 * out))]
+        return [stem, ellipsoid((x, y, z + out - 0.75 * half), (half, half, 0.75 * half))]
+
+
+StandStyle = Literal["floor", "plinth", "tapered", "square", "round", "castors", "runners", "sides"]
+
+
+def stand(
+    rng: np.random.Generator, style: StandStyle, size: tuple[float, float, float]
+) -> list[Solid]:
+    """What carries a cabinet: at most four solids between y = 0 and y = height.
+
+    Args:
+      style: "floor" is nothing at all (then height is 0), "plinth" a block set back from the
+        front, "runners" two skids from front to back, "sides" the side panels drawn down.
+      size: (width, height, depth); x is centered, the front is at z = 0.
+    """
+    width, height, depth = size
+    if style == "floor":
+        return []
+    half = np.array([width, height, depth]) / 2
+    if style == "plinth":
+        back = rng.uniform(0.0, 0.12) * depth
+        aside = rng.uniform(0.0, 0.04) * width
+        front = rng.uniform(0.005, 0.12) * depth
+        z = (-front - (depth - back)) / 2
+        return [box((0, half[1], z), (half[0] - aside, half[1], (depth - front - back) / 2))]
+    if style in ("runners", "sides"):
+        thick = width * (rng.uniform(0.015, 0.035) if style == "sides" else 0.035)
+        inset = 0.0 if style == "sides" else rng.uniform(0.0, 0.08) * width
+        return [
+            box((side * (half[0] - thick - inset), half[1], -half[2]), (thick, half[1], half[2]))
+            for side in (-1, 1)
+        ]
+    thick = min(rng.uniform(0.018, 0.04) * np.sqrt(width * depth), 0.6 * height + 0.006)
+    inset = thick + rng.uniform(0.0, 0.1) * min(width, depth)
+    taper = rng.uniform(0.4, 0.8, size=2)
+    solids: list[Solid] = []
+    for x in (-half[0] + inset, half[0] - inset):
+        for z in (-inset, -depth + inset):
+            if style == "tapered":
+                extents = (thick, thick, half[1])
+                solids.append(frustum((x, half[1], z), extents, taper, UPSIDE_DOWN))
+            elif style == "square":
+                solids.append(box((x, half[1], z), (thick, half[1], thick)))
+            elif style == "round":
+                solids.append(cylinder((x, half[1], z), (thick, thick, half[1]), TURN_Y))
+            else:  # castors: wheels as high as the gap that they fill
+                solids.append(cylinder((x, half[1], z), (half[1], half[1], 0.45 * thick), TURN_X))
     return solids

@@ -167,7 +167,7 @@ LAPTOP = Category(
     symmetries=(
         Symmetry(
             permutation=(1, 0),
-            turn=((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+            rotation=((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
             reason="without a visible keyboard, base and lid are two like plates",
         ),
     ),

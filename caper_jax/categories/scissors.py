@@ -13,21 +13,142 @@ The frame and the root follow from the object itself:
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry, Viewpoint
-from caper_jax.categories.forms import about, mirrored, turned
-from caper_jax.categories.scissors_half import Half, blade_solids, handle_solids
+from caper_jax.categories.forms import about, beam, chain, mirrored, rotated
+from caper_jax.geometry.solids import Solid, box, cylinder
 
 _Y = np.array([0.0, 1.0, 0.0])
+_FLAT = about("x", -np.pi / 2)  # cylinder z -> y
 _HALF_TURN = np.diag([1.0, -1.0, -1.0])
 _REST = np.radians(20.0)
 _CLOSED, _WIDE = np.radians(3.0), np.radians(60.0)
 
 
-def _office(rng: np.random.Generator) -> tuple[Half, Half]:
+@dataclass(frozen=True)
+class _Half:
+    """One blade with its handle, closed: tip at +x, handle at -x and -z; lengths in meters.
+
+    Attributes:
+      blade: from the pivot to the tip.
+      width: of the blade at the pivot.
+      tip: width of the blade at its tip.
+      belly: where the blade starts to narrow, as a share of its length.
+      round_tip: a disc as wide as ``tip`` ends the blade.
+      metal: thickness of the blade.
+      shank: from the pivot to the handle's loop.
+      loop: (a, b) half extents of the opening for the fingers, along and across the handle.
+      flat: share of the opening's half width that its inner side is flattened to, 1 for an oval.
+      egg: how much wider the loop is towards its end than its middle.
+      tube: (half width, half thickness) of the loop's section.
+      ring: a ring with upright sides instead of a round tube.
+      splay: angle of the loop to the handle's line, radians.
+      gap: least distance of the handle from the middle when closed.
+      sheath: (half width, half thickness) of the plastic around the shank, or None.
+      screw: (radius, height) of the disc at the pivot.
+      teeth: number of bosses on the inner side of the shank.
+      rest: length of the finger rest behind the loop, or 0.
+      bend: angle of the handle to the blade, radians; positive turns it to +z.
+    """
+
+    blade: float
+    width: float
+    tip: float
+    belly: float
+    round_tip: bool
+    metal: float
+    shank: float
+    loop: tuple[float, float]
+    flat: float
+    egg: float
+    tube: tuple[float, float]
+    ring: bool
+    splay: float
+    gap: float
+    sheath: tuple[float, float] | None
+    screw: tuple[float, float]
+    teeth: int = 0
+    rest: float = 0.0
+    bend: float = 0.0
+
+
+def _blade(half: _Half) -> list[Solid]:
+    """Above the plane y = 0 in which the blades meet; the line to the tip is the x axis."""
+    y, across = half.metal / 2, half.metal / 2
+    heel = np.array([-0.55 * half.width, y, 0.0])
+    neck = np.array([half.belly * half.blade, y, 0.0])
+    reach = half.blade - (half.tip / 2 if half.round_tip else 0.0)
+    point = np.array([reach, y, 0.0])
+    wide = half.width / 2
+    waist = wide + (half.tip / 2 - wide) * 0.45 * half.belly
+    solids = [
+        beam(heel, neck, (wide, across), _Y, (waist / wide, 1.0)),
+        beam(neck, point, (waist, across), _Y, (half.tip / 2 / waist, 1.0)),
+    ]
+    if half.round_tip:
+        solids.append(cylinder(point, (half.tip / 2, half.tip / 2, across), _FLAT))
+    radius, height = half.screw
+    solids.append(
+        cylinder(
+            (0, half.metal / 2 + height / 2, 0), (radius, radius, (half.metal + height) / 2), _FLAT
+        )
+    )
+    return solids
+
+
+def _loop(half: _Half) -> tuple[list[Solid], np.ndarray]:
+    """The loop for the fingers, and the corners [n, 3] of its middle line."""
+    turn = 2 * np.pi * np.arange(12) / 12
+    a, b = half.loop[0] + half.tube[0], half.loop[1] + half.tube[0]
+    x, z = a * np.cos(turn), b * np.sin(turn)
+    if not half.ring:
+        z = np.minimum(z, half.flat * b) * (1 - half.egg * x / a)
+    splay = about("y", -half.splay)
+    middle = np.stack([x, np.zeros(12), z], axis=1) @ splay.T
+    # Behind the shank, and to its own side of the middle. The ring bulges between its corners.
+    bulge = half.tube[0] + (0.04 * b if half.ring else 0.0)
+    center = np.array([-half.shank, 0.0, -half.gap]) - (bulge, 0.0, bulge) - middle.max(axis=0)
+    middle = middle + center
+    if not half.ring:
+        return chain(middle, half.tube, _Y, closed=True, round_=True), middle
+    turn_flat = splay @ _FLAT
+    outer = (a + half.tube[0], b + half.tube[0], half.tube[1])
+    hole = cylinder(center, (*half.loop, 2 * half.tube[1]), turn_flat)
+    return [cylinder(center, outer, turn_flat, hole)], middle
+
+
+def _handle(half: _Half) -> list[Solid]:
+    """Shank, sheath, loop and what is on them."""
+    solids, middle = _loop(half)
+    width = half.sheath[0] if half.sheath else 0.3 * half.width
+    start = np.array([-0.3 * half.width, half.metal / 2, 0.0])
+    # Behind the pivot the shank bends to its own side of the middle.
+    elbow = np.array([-0.35 * half.shank - 0.3 * half.width, 0.0, -half.gap - width])
+    nearest = middle[np.argmin(np.linalg.norm(middle - elbow, axis=1))]
+    tang = (0.36 * half.width, half.metal / 2)
+    solids.append(beam(start, elbow + (0, half.metal / 2, 0), tang, _Y))
+    way = nearest - elbow
+    if half.sheath:
+        taper = np.minimum(1.0, np.array(half.tube) / half.sheath)
+        solids.append(beam(elbow - 0.1 * way, nearest, half.sheath, _Y, taper))
+    else:
+        thick = max(half.metal / 2, 0.7 * half.tube[1])
+        solids.append(beam(elbow - 0.1 * way, nearest, (width, thick), _Y, (0.8, 1.0)))
+    for tooth in range(half.teeth):
+        place = elbow + way * (0.3 + 0.35 * tooth) + (0, 0, 0.45 * width)
+        size = (0.12 * np.abs(way[0]), 0.5 * half.tube[1], 0.5 * width)
+        solids.append(box(place, size))
+    if half.rest:
+        end = middle[np.argmin(middle[:, 0])]
+        out = np.array([-0.9 * half.rest, 0.0, -0.45 * half.rest])
+        solids.append(beam(end, end + out, half.tube, _Y, round_=True))
+    return [rotated(solid, about("y", half.bend)) for solid in solids]
+
+
+def _office(rng: np.random.Generator) -> tuple[_Half, _Half]:
     """Household and office scissors, metal or with plastic handles, 120-230 mm."""
     blade = rng.uniform(0.052, 0.105)
     plastic = rng.random() < 0.75
@@ -35,7 +156,7 @@ def _office(rng: np.random.Generator) -> tuple[Half, Half]:
     if not plastic:
         tube = rng.uniform(0.0016, 0.0028), rng.uniform(0.0015, 0.003)
     width = rng.uniform(0.09, 0.17) * blade + 0.003
-    half = Half(
+    half = _Half(
         blade=blade,
         width=width,
         tip=rng.uniform(0.0012, 0.35 * width),
@@ -58,7 +179,7 @@ def _office(rng: np.random.Generator) -> tuple[Half, Half]:
     return _uneven(rng, half, half.loop[0] * rng.uniform(1.12, 1.9), rng.uniform(1.05, 1.25))
 
 
-def _kitchen(rng: np.random.Generator) -> tuple[Half, Half]:
+def _kitchen(rng: np.random.Generator) -> tuple[_Half, _Half]:
     """Broad and short-bladed, with big loops and often a bottle opener between the handles."""
     half, _ = _office(rng)
     tube = rng.uniform(0.0028, 0.005), rng.uniform(0.0045, 0.0075)
@@ -80,7 +201,7 @@ def _kitchen(rng: np.random.Generator) -> tuple[Half, Half]:
     return _uneven(rng, half, half.loop[0] * rng.uniform(1.15, 1.6), rng.uniform(1.0, 1.2))
 
 
-def _child(rng: np.random.Generator) -> tuple[Half, Half]:
+def _child(rng: np.random.Generator) -> tuple[_Half, _Half]:
     """Short, blunt and round-tipped, with plastic loops that are large for the blades."""
     half, _ = _office(rng)
     tip = rng.uniform(0.005, 0.01)
@@ -101,7 +222,7 @@ def _child(rng: np.random.Generator) -> tuple[Half, Half]:
     return _uneven(rng, half, half.loop[0] * rng.uniform(1.3, 1.6), rng.uniform(1.0, 1.2))
 
 
-def _tailor(rng: np.random.Generator) -> tuple[Half, Half]:
+def _tailor(rng: np.random.Generator) -> tuple[_Half, _Half]:
     """Long shears whose handles are bent upwards, for four fingers and for the thumb."""
     half, _ = _office(rng)
     tube = rng.uniform(0.003, 0.0048), rng.uniform(0.0045, 0.0075)
@@ -124,7 +245,7 @@ def _tailor(rng: np.random.Generator) -> tuple[Half, Half]:
     return replace(root, tip=root.tip * rng.uniform(1.0, 1.6)), other
 
 
-def _hair(rng: np.random.Generator) -> tuple[Half, Half]:
+def _hair(rng: np.random.Generator) -> tuple[_Half, _Half]:
     """Slim, all metal, with small round loops on long shanks; perhaps a finger rest."""
     half, _ = _office(rng)
     width = rng.uniform(0.006, 0.01)
@@ -154,7 +275,7 @@ def _hair(rng: np.random.Generator) -> tuple[Half, Half]:
     )
 
 
-def _nail(rng: np.random.Generator) -> tuple[Half, Half]:
+def _nail(rng: np.random.Generator) -> tuple[_Half, _Half]:
     """Nail and embroidery scissors: all metal, 80-120 mm, short pointed blades."""
     half, _ = _hair(rng)
     half = replace(
@@ -169,7 +290,9 @@ def _nail(rng: np.random.Generator) -> tuple[Half, Half]:
     return half, half
 
 
-def _uneven(rng: np.random.Generator, half: Half, length: float, wider: float) -> tuple[Half, Half]:
+def _uneven(
+    rng: np.random.Generator, half: _Half, length: float, wider: float
+) -> tuple[_Half, _Half]:
     """The half with a loop for several fingers (``length`` its half length), and that half."""
     large = replace(
         half,
@@ -190,12 +313,10 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     kind = _KINDS[rng.choice(len(_KINDS), p=_SHARES)]
     root_half, other_half = kind(rng)
     other_half = replace(other_half, bend=-other_half.bend)  # the same way, after the half turn
-    root = blade_solids(root_half) + handle_solids(root_half)
-    other = [
-        turned(solid, _HALF_TURN) for solid in blade_solids(other_half) + handle_solids(other_half)
-    ]
+    root = _blade(root_half) + _handle(root_half)
+    other = [rotated(solid, _HALF_TURN) for solid in _blade(other_half) + _handle(other_half)]
     parts = [
-        [turned(solid, about("y", angle)) for solid in solids]
+        [rotated(solid, about("y", angle)) for solid in solids]
         for solids, angle in ((root, -_REST / 2), (other, _REST / 2))
     ]
     if rng.random() < 0.1:
@@ -223,7 +344,7 @@ SCISSORS = Category(
     symmetries=(
         Symmetry(
             permutation=(1, 0),
-            turn=((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
+            rotation=((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
             reason="equal halves change places by a half turn about x",
             # Halves that differ have other handles, by more than this in length or width.
             tolerance=0.05,

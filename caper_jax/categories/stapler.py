@@ -5,11 +5,12 @@ The arm carries magazine, cover and handle; x runs along the hinge, z to the fro
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
-from caper_jax.categories.forms import about, beam, turned
-from caper_jax.categories.stapler_plan import TYPES, Plan, draw_plan
+from caper_jax.categories.forms import about, beam, rotated
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid
 
 # Positive opens: the arm, in front of the hinge (+z), swings up (+y), which is about -x.
@@ -19,8 +20,75 @@ _TURN_Y = about("x", -np.pi / 2)  # cylinder z -> y
 _UP = (0.0, 1.0, 0.0)
 _OPEN = np.radians(60)
 
+# Probability, length and width of the base in meters, scale of the thicknesses. "half" are those
+# of the seven ReArt-48 staplers: base 120-162 x 34-42 mm and 28-35 high with the hinge's cheeks,
+# hinge 2-10 mm inside the back and 23-29 mm above the underside, arm 27-32 mm wide.
+_TYPES = {
+    "half": (0.42, (0.105, 0.17), (0.028, 0.045), (0.8, 1.2)),
+    "desk": (0.2, (0.15, 0.215), (0.032, 0.048), (0.9, 1.3)),
+    "mini": (0.12, (0.045, 0.08), (0.017, 0.03), (0.55, 0.85)),
+    "long": (0.08, (0.28, 0.42), (0.036, 0.06), (1.0, 1.4)),
+    "heavy": (0.1, (0.22, 0.32), (0.05, 0.085), (1.4, 2.2)),
+    "plier": (0.08, (0.08, 0.12), (0.016, 0.026), (0.9, 1.3)),
+}
 
-def _base(rng: np.random.Generator, plan: Plan, name: str) -> list[Solid]:
+
+@dataclass(frozen=True)
+class _Plan:
+    """Measures in meters; the underside of the base is y = 0, the hinge z = 0, x is centered.
+
+    Attributes:
+      scale: of thicknesses and small parts, 1 for an office stapler.
+      back, front: z of the ends of the base.
+      width, plate: width and thickness of its plate.
+      hinge: height of the hinge.
+      under, magazine, cover: underside of the arm, height of its magazine and of its cover.
+      arm, head, reach: width of the arm, z of the back and the front of its head.
+    """
+
+    scale: float
+    back: float
+    front: float
+    width: float
+    plate: float
+    hinge: float
+    under: float
+    magazine: float
+    cover: float
+    arm: float
+    head: float
+    reach: float
+
+
+def _draw_plan(rng: np.random.Generator, name: str) -> _Plan:
+    _, lengths, widths, scales = _TYPES[name]
+    length, width, scale = rng.uniform(*lengths), rng.uniform(*widths), rng.uniform(*scales)
+    back = -length * rng.uniform(0.02, 0.09)
+    front = length + back
+    plate = scale * rng.uniform(0.0035, 0.0105)
+    under = plate + scale * rng.uniform(0.002, 0.009)
+    magazine = scale * rng.uniform(0.006, 0.012)
+    reach = front * rng.uniform(0.88, 1.04)
+    head = back * rng.uniform(0.2, 1.0)
+    if name == "long":  # the head is as long as that of an office stapler, at the end of a bar
+        head = reach - rng.uniform(0.09, 0.15)
+    return _Plan(
+        scale=scale,
+        back=back,
+        front=front,
+        width=width,
+        plate=plate,
+        hinge=under + magazine * rng.uniform(0.4, 1.3),
+        under=under,
+        magazine=magazine,
+        cover=scale * rng.uniform(0.007, 0.02) * (1.4 if name == "heavy" else 1.0),
+        arm=width * rng.uniform(0.62, 0.93),
+        head=head,
+        reach=reach,
+    )
+
+
+def _base(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
     """Plate with rounded or tapered ends, anvil, what stands under it and what carries the pin."""
     half, middle = plan.width / 2, (plan.front + plan.back) / 2
     foot = 0.0
@@ -66,7 +134,7 @@ def _base(rng: np.random.Generator, plan: Plan, name: str) -> list[Solid]:
     return solids
 
 
-def _anvil(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def _anvil(rng: np.random.Generator, plan: _Plan) -> list[Solid]:
     """The plate with two grooves under the head, that bends the staples."""
     gap = plan.under - plan.plate
     height = gap * rng.uniform(0.15, 0.7)
@@ -83,7 +151,7 @@ def _anvil(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     return [box(center, (half[0], height / 2 + 0.0005, half[1]), hole=groove)]
 
 
-def _cheeks(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def _cheeks(rng: np.random.Generator, plan: _Plan) -> list[Solid]:
     """Two cheeks beside the arm, or a block between its sides, and the pin of the hinge."""
     radius = plan.scale * rng.uniform(0.0015, 0.004)
     top = plan.hinge + radius * rng.uniform(0.8, 2.0)
@@ -114,7 +182,7 @@ def _cheeks(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     return solids
 
 
-def _cover(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def _cover(rng: np.random.Generator, plan: _Plan) -> list[Solid]:
     """The cover over the magazine, from back to front; its underside is level before tilting."""
     bottom, height, half = plan.under + 0.55 * plan.magazine, plan.cover, plan.arm / 2
     back, front = plan.head, plan.reach
@@ -157,7 +225,7 @@ def _cover(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     return solids
 
 
-def _arm(rng: np.random.Generator, plan: Plan, name: str) -> list[Solid]:
+def _arm(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
     """Magazine, cover and nose plate, perhaps a bar that carries them or a lever above them."""
     half = plan.arm / 2
     inner = half * rng.uniform(0.5, 0.95)
@@ -171,7 +239,7 @@ def _arm(rng: np.random.Generator, plan: Plan, name: str) -> list[Solid]:
     arm = [box(place, (inner, plan.magazine / 2, (front - start) / 2))]
     tilt = np.radians(rng.uniform(0.5, 7)) if rng.random() < 0.5 and name != "long" else 0.0
     cover = _cover(rng, plan)
-    arm += [turned(solid, about("x", -tilt), (0.0, plan.hinge, 0.0)) for solid in cover]
+    arm += [rotated(solid, about("x", -tilt), (0.0, plan.hinge, 0.0)) for solid in cover]
     if rng.random() < 0.5:  # the plate at the nose behind which the staples are driven down
         rise = (plan.magazine + plan.cover * rng.uniform(0.1, 0.4)) / 2
         arm.append(box((0, plan.under + rise, front), (inner * 0.9, rise, plan.scale * 0.0008)))
@@ -187,7 +255,7 @@ def _arm(rng: np.random.Generator, plan: Plan, name: str) -> list[Solid]:
     return arm
 
 
-def _lever(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def _lever(rng: np.random.Generator, plan: _Plan) -> list[Solid]:
     """The long lever of heavy staplers, over the cover and perhaps beyond it."""
     rise = plan.under + plan.magazine + plan.cover
     foot = (0.0, plan.under + plan.magazine, plan.reach * rng.uniform(0.05, 0.3))
@@ -205,7 +273,7 @@ def _lever(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     ]
 
 
-def _plier(rng: np.random.Generator, plan: Plan) -> tuple[list[Solid], list[Solid]]:
+def _plier(rng: np.random.Generator, plan: _Plan) -> tuple[list[Solid], list[Solid]]:
     """Stapling pliers: each part is a jaw in front of the pin and a handle behind it.
 
     As in any pliers the parts cross at the pin: the lower jaw goes on as the upper handle, so
@@ -249,8 +317,8 @@ def _plier(rng: np.random.Generator, plan: Plan) -> tuple[list[Solid], list[Soli
 
 def shape(rng: np.random.Generator) -> ObjectModel:
     """Draws one stapler; four in ten have the proportions of the ReArt-48 ones."""
-    name = str(rng.choice(list(TYPES), p=[row[0] for row in TYPES.values()]))
-    plan = draw_plan(rng, name)
+    name = str(rng.choice(list(_TYPES), p=[row[0] for row in _TYPES.values()]))
+    plan = _draw_plan(rng, name)
     if name == "plier":
         base, arm = _plier(rng, plan)
         high = np.radians(rng.uniform(14, 25))

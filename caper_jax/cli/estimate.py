@@ -194,7 +194,7 @@ def _certainty(prediction: Prediction, category: Category) -> str:
         for j, kind in enumerate(category.joint_types):
             state = format_state(float(prediction.state_std[j]), kind)
             lines.append(f"{joint_name(category, j)}: standard deviation {state}")
-    for name, count in zip(category.parts, prediction.seen, strict=True):
+    for name, count in zip(category.parts, prediction.points_per_part, strict=True):
         if count < HIDDEN_POINTS:
             lines.append(f"{name}: hidden ({count} points), known through its joint alone")
     return "".join(f"{line}\n" for line in lines)
@@ -219,9 +219,9 @@ def _as_json(prediction: Prediction, category: Category, cloud: Cloud) -> dict[s
         "points": {
             "available": cloud.available,
             "dropped": cloud.dropped,
-            "of_parts": prediction.seen.tolist(),
+            "of_parts": prediction.points_per_part.tolist(),
         },
-        "hidden": [bool(count < HIDDEN_POINTS) for count in prediction.seen],
+        "hidden": [bool(count < HIDDEN_POINTS) for count in prediction.points_per_part],
     }
     if prediction.rotation_std is not None:
         factors = [np.degrees(1.0) if unit == "degrees" else 1.0 for _, unit in states]

@@ -14,7 +14,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = common.create_parser(
         "export",
         "Writes a model as StableHLO with its weights inside, a manifest of its inputs and\n"
-        "outputs, and a short program that runs it with jax and numpy alone.",
+        "outputs, and a short program that runs it with jax, numpy and flatbuffers alone.",
         [
             ("--category box --out serving/box", "for CPU and NVIDIA GPUs, one cloud at a time"),
             ("--category box --out serving/box --platform tpu --batch any", "batches of any size"),

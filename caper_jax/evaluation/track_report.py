@@ -69,7 +69,7 @@ def frame_record(
         "joints": joints,
         "energy": round(float(result.energy), 7),
         "keyframe": bool(result.keyframe),
-        "estimated": bool(result.estimated),
+        "estimated": bool(result.estimator_queried),
         "lost": bool(result.lost),
         "milliseconds": round(1000 * seconds, 3),
     }
@@ -92,7 +92,7 @@ def track_records(track: Track, category: Category) -> Iterator[dict[str, Any]]:
             labels=None,
             energy=track.energy[index],
             keyframe=track.keyframe[index],
-            estimated=track.estimated[index],
+            estimator_queried=track.estimated[index],
             lost=track.lost[index],
         )
         yield frame_record(frame, result, category, float(track.seconds[index]))

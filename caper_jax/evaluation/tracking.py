@@ -101,7 +101,7 @@ def track_video(
         else None,
         energy=stacked.energy,
         keyframe=stacked.keyframe,
-        estimated=stacked.estimated,
+        estimated=stacked.estimator_queried,
         lost=stacked.lost,
         seconds=np.array(seconds),
     )

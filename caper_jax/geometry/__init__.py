@@ -1,6 +1,5 @@
-"""Geometry: rotations, rigid transforms, directions, boxes and solids."""
+"""Geometry: frames, rotations from two directions, boxes, solids and the order of points."""
 
-from caper_jax.geometry import boxes, solids, two_axis_rotation
-from caper_jax.lie import linalg, se3, so3
+from caper_jax.geometry import boxes, frames, raster_order, solids, two_axis_rotation
 
-__all__ = ["boxes", "linalg", "se3", "so3", "solids", "two_axis_rotation"]
+__all__ = ["boxes", "frames", "raster_order", "solids", "two_axis_rotation"]

@@ -37,6 +37,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from caper_jax.lie.linalg import apply, as_floating, dot, multiply, transpose
 
@@ -52,7 +53,7 @@ _FAR = 1e6
 
 def corners(
     rotation: ArrayLike, translation: ArrayLike, center: ArrayLike, size: ArrayLike
-) -> jax.Array:
+) -> Float[Array, "... 8 3"]:
     """Corners [..., 8, 3] of posed boxes, in the order (-,-,-), (-,-,+), (-,+,-), ... of x, y, z.
 
     Args:
@@ -70,7 +71,7 @@ def corners(
     return apply(rotation[..., None, :, :], local) + translation[..., None, :]
 
 
-def iou_size(size_a: ArrayLike, size_b: ArrayLike) -> jax.Array:
+def iou_size(size_a: ArrayLike, size_b: ArrayLike) -> Float[Array, "..."]:
     """Intersection over union [...] of two boxes of sizes [..., 3] with common center and axes.
 
     0 where a size is not finite or not positive.
@@ -92,7 +93,7 @@ def iou_full(
     rotation_b: ArrayLike,
     center_b: ArrayLike,
     size_b: ArrayLike,
-) -> jax.Array:
+) -> Float[Array, "..."]:
     """Exact intersection over union [...] of oriented boxes, batched by broadcasting.
 
     Args:

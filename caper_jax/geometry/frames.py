@@ -4,36 +4,41 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
 
-def rotate(rotation, points):
-    """[B, 3, 3], [B, N, 3] -> [B, N, 3], elementwise so that no backend rounds the factors."""
+def rotate(
+    rotation: Float[Array, "#B 3 3"], points: Float[Array, "#B N 3"]
+) -> Float[Array, "b N 3"]:
+    """Rotated points, elementwise so that no backend rounds the factors."""
     return (rotation[:, None, :, :] * points[:, :, None, :]).sum(-1)
 
 
-def multiply(first, second):
-    """[..., 3, 3] @ [..., 3, 3] in full precision."""
+def multiply(
+    first: Float[Array, "*#batch 3 3"], second: Float[Array, "*#batch 3 3"]
+) -> Float[Array, "... 3 3"]:
+    """Product of rotations in full precision."""
     return jnp.matmul(first, second, precision="highest")
 
 
-def transpose(rotation):
-    """Inverse of rotations [..., 3, 3]."""
+def transpose(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+    """Inverse of rotations."""
     return jnp.swapaxes(rotation, -1, -2)
 
 
-def view_rotation(points, roll: float = 0.0):
+def view_rotation(points: Float[Array, "B N 3"], roll: float = 0.0) -> Float[Array, "B 3 3"]:
     """The shortest rotation that turns the ray to the cloud's mean into the optical axis.
 
     An object looks the same wherever in the image it stands; after this rotation it also has the
     same coordinates, up to roll and distance. (Not in the paper; it costs nothing.)
 
     Args:
-      points: [B, N, 3], camera frame.
-      roll: static, degrees by which things are turned clockwise in the image; that is undone
+      points: camera frame.
+      roll: static, degrees by which things appear rotated clockwise in the image; that is undone
         first (``Viewpoint.camera_roll``).
 
     Returns:
-      [B, 3, 3], camera -> viewing frame.
+      Camera -> viewing frame.
     """
     if roll:
         cos, sin = np.cos(np.radians(roll)), np.sin(np.radians(roll))
@@ -55,27 +60,15 @@ def view_rotation(points, roll: float = 0.0):
     return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
-def canonicalize(points, rotation, translation):
-    """Camera -> root's canonical space: R^T (p - t), Sec 5.2.
-
-    Args:
-      points: [B, N, 3].
-      rotation: [B, 3, 3] root pose.
-      translation: [B, 3].
-    """
+def canonicalize(
+    points: Float[Array, "B N 3"], rotation: Float[Array, "B 3 3"], translation: Float[Array, "B 3"]
+) -> Float[Array, "B N 3"]:
+    """Camera -> root's canonical space: R^T (p - t), with the root's pose (Sec 5.2)."""
     return rotate(transpose(rotation), points - translation[:, None, :])
 
 
-def part_points(points, chosen):
-    """The chosen points, each repeated as often as fills the cloud; all of them if none is chosen.
-
-    Args:
-      points: [B, N, 3].
-      chosen: [B, N] bool.
-
-    Returns:
-      [B, N, 3].
-    """
+def part_points(points: Float[Array, "B N 3"], chosen: Bool[Array, "B N"]) -> Float[Array, "B N 3"]:
+    """The chosen points, repeated evenly to fill the cloud; all points if none is chosen."""
     chosen = chosen | ~chosen.any(axis=1, keepdims=True)
     number = points.shape[1]
     count = chosen.sum(axis=1, keepdims=True)

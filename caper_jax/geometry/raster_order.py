@@ -1,7 +1,7 @@
-"""Scan order: points along the rows of an image that they fall on, to and fro.
+"""Raster order: points along the rows of the image that they fall on, alternately left and right.
 
-Networks look at every so-manieth point of a cloud in several places; what those show of the object
-depends on the order of the points. In scan order they are spread evenly over the image, whatever
+Networks look at every n-th point of a cloud in several places; what those show of the object
+depends on the order of the points. In raster order they are spread evenly over the image, whatever
 order the points came in, and so is every pick of evenly spaced ones.
 """
 
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Int, Integer, Shaped
 
 ROWS = 32  # over an object that fills its box
 _ROW_BITS = 6
@@ -62,13 +63,17 @@ def raster_order(points) -> Any:
     return order.astype(np.int64) if on_host else order
 
 
-def to_raster_order(values, order):
-    """Rows of values [B, N, C] by order [B, N], as of ``raster_order``."""
+def to_raster_order(
+    values: Shaped[Array, "B N C"], order: Integer[Array, "B N"]
+) -> Shaped[Array, "B N C"]:
+    """Rows of values in the order of ``raster_order``."""
     return jnp.take_along_axis(values, order[..., None], axis=-2, mode="promise_in_bounds")
 
 
-def from_raster_order(values, order):
-    """Rows of values [B, N, C] back where they were before ``to_raster_order``."""
+def from_raster_order(
+    values: Shaped[Array, "B N C"], order: Integer[Array, "B N"]
+) -> Shaped[Array, "B N C"]:
+    """Rows of values back where they were before ``to_raster_order``."""
 
     def put(rows, order):
         nothing = jnp.zeros_like(rows)
@@ -77,8 +82,8 @@ def from_raster_order(values, order):
     return jax.vmap(put)(values, order)
 
 
-def grid_raster_order(lines: int) -> np.ndarray:
-    """The scan order of all pixels of an image of ``lines`` by ``lines``: [lines^2] raster indices.
+def grid_raster_order(lines: int) -> Int[np.ndarray, "pixels"]:
+    """The raster order of all pixels of an image of ``lines`` by ``lines``: raster indices.
 
     Subsets in this order are nearly in that of ``raster_order``, without a sort.
     """

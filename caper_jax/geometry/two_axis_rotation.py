@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
 
 from caper_jax.errors import CaperError
 from caper_jax.lie.linalg import as_floating, cross, dot, norm, unit
@@ -30,7 +31,7 @@ def rotation_from_directions(
     confidence_first: ArrayLike,
     confidence_second: ArrayLike,
     axes: tuple[str, str] = ("y", "z"),
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[Float[Array, "*batch 3 3"], Bool[Array, "*batch"]]:
     """The rotation whose axes are the corrected directions (paper Eq 3).
 
     Args:

@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from caper_jax.errors import CaperError
 
 
-def as_floating(value: ArrayLike, shape: Sequence[int], name: str) -> jax.Array:
+def as_floating(value: ArrayLike, shape: Sequence[int], name: str) -> Float[Array, "..."]:
     """The value as a floating array whose trailing axes are ``shape``.
 
     Raises:
@@ -31,13 +32,13 @@ def as_floating(value: ArrayLike, shape: Sequence[int], name: str) -> jax.Array:
     return array.astype(jnp.result_type(float))
 
 
-def dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Inner product [...] of vectors [..., D], for small D."""
+def dot(a: Float[Array, "*#batch D"], b: Float[Array, "*#batch D"]) -> Float[Array, "..."]:
+    """Inner product of vectors, for small D."""
     return dot_of(entries(a), entries(b))
 
 
-def cross(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Cross product [..., 3] of vectors [..., 3]."""
+def cross(a: Float[Array, "*#batch 3"], b: Float[Array, "*#batch 3"]) -> Float[Array, "... 3"]:
+    """Cross product of vectors."""
     return from_entries(cross_of(entries(a), entries(b)))
 
 
@@ -63,7 +64,7 @@ def from_entries(parts: Sequence[jax.Array]) -> jax.Array:
     """Vectors [..., D] of D entries [...]; inverts ``entries``.
 
     Choices compile to one loop that evaluates what the entries share once; XLA on a CPU evaluates
-    it anew for each operand of a concatenation, and all that this in turn shares.
+    it again for each operand of a concatenation, and all that this in turn shares.
     """
     index = np.arange(len(parts))
     result = parts[0][..., None]
@@ -88,7 +89,7 @@ def from_rows(parts: Sequence[Sequence[jax.Array]]) -> jax.Array:
 @from_rows.defjvp
 def _from_rows_jvp(primals, tangents):
     # The reverse of one concatenation cancels that of rows. XLA computes the operands of more than
-    # eight apart, so that nothing they share is evaluated anew.
+    # eight apart, so that nothing they share is evaluated twice.
     (parts,), (changes,) = primals, tangents
     flat = jnp.stack([entry for row in changes for entry in row], axis=-1)
     return from_rows(parts), flat.reshape(*flat.shape[:-1], len(parts), len(parts[0]))
@@ -111,32 +112,36 @@ def cross_of(a: Sequence[jax.Array], b: Sequence[jax.Array]) -> list[jax.Array]:
     return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
-def norm(vector: jax.Array) -> jax.Array:
-    """Euclidean length [...] of vectors [..., D], with derivative 0 at the zero vector."""
+def norm(vector: Float[Array, "*batch D"]) -> Float[Array, "*batch"]:
+    """Euclidean length of vectors, with derivative 0 at the zero vector."""
     squared = dot(vector, vector)
     zero = squared == 0.0
     # Both branches of a `where` are differentiated, so sqrt must not see the zero.
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
 
-def unit(vector: jax.Array) -> jax.Array:
-    """Vectors [..., D] scaled to length 1; the zero vector stays zero, with finite derivative."""
+def unit(vector: Float[Array, "*batch D"]) -> Float[Array, "*batch D"]:
+    """Vectors scaled to length 1; the zero vector stays zero, with finite derivative."""
     length = norm(vector)[..., None]
     return vector / jnp.where(length > 0, length, 1.0)
 
 
-def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Matrix product of small matrices [..., I, K] and [..., K, J], element by element."""
+def multiply(
+    a: Float[Array, "*#batch I K"], b: Float[Array, "*#batch K J"]
+) -> Float[Array, "... I J"]:
+    """Matrix product of small matrices, element by element."""
     terms = [a[..., :, k, None] * b[..., None, k, :] for k in range(a.shape[-1])]
     return sum(terms[1:], start=terms[0])
 
 
-def apply(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """Matrix-vector product of [..., I, K] and [..., K], element by element."""
+def apply(
+    matrix: Float[Array, "*#batch I K"], vector: Float[Array, "*#batch K"]
+) -> Float[Array, "... I"]:
+    """Matrix-vector product, element by element."""
     terms = [matrix[..., :, k] * vector[..., k, None] for k in range(matrix.shape[-1])]
     return sum(terms[1:], start=terms[0])
 
 
-def transpose(matrix: jax.Array) -> jax.Array:
-    """[..., I, J] -> [..., J, I]."""
+def transpose(matrix: Float[Array, "*batch I J"]) -> Float[Array, "*batch J I"]:
+    """Transposed matrices."""
     return jnp.swapaxes(matrix, -1, -2)

@@ -12,6 +12,7 @@ import math
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from caper_jax.lie import so3
 from caper_jax.lie.linalg import (
@@ -29,7 +30,7 @@ from caper_jax.lie.linalg import (
 )
 
 
-def from_rt(rotation: ArrayLike, translation: ArrayLike) -> jax.Array:
+def from_rt(rotation: ArrayLike, translation: ArrayLike) -> Float[Array, "... 4 4"]:
     """Transform [..., 4, 4] ``p -> R p + t`` from R [..., 3, 3] and t [..., 3]."""
     r = as_floating(rotation, (3, 3), "rotation")
     t = as_floating(translation, (3,), "translation")
@@ -46,20 +47,20 @@ def from_rt(rotation: ArrayLike, translation: ArrayLike) -> jax.Array:
     return jnp.concatenate([top, bottom], axis=-2)
 
 
-def hat(xi: ArrayLike) -> jax.Array:
+def hat(xi: ArrayLike) -> Float[Array, "... 4 4"]:
     """Matrix [..., 4, 4] of a twist [..., 6]: ``[[hat(w), rho], [0, 0]]``."""
     w, rho = _split(xi)
     top = jnp.concatenate([so3.hat(w), rho[..., None]], axis=-1)
     return jnp.concatenate([top, jnp.zeros_like(top[..., :1, :])], axis=-2)
 
 
-def vee(matrix: ArrayLike) -> jax.Array:
+def vee(matrix: ArrayLike) -> Float[Array, "... 6"]:
     """Twist [..., 6] of ``hat``'s matrix [..., 4, 4]."""
     matrix = as_floating(matrix, (4, 4), "matrix")
     return jnp.concatenate([so3.vee(matrix[..., :3, :3]), matrix[..., :3, 3]], axis=-1)
 
 
-def exp(xi: ArrayLike) -> jax.Array:
+def exp(xi: ArrayLike) -> Float[Array, "... 4 4"]:
     """Transform [..., 4, 4] of a twist (w, rho) [..., 6]."""
     twist = entries(as_floating(xi, (6,), "xi"))
     w, rho = twist[:3], twist[3:]
@@ -71,7 +72,7 @@ def exp(xi: ArrayLike) -> jax.Array:
     return from_rows([*top, [zero, zero, zero, zero + 1]])
 
 
-def log(transform: ArrayLike) -> jax.Array:
+def log(transform: ArrayLike) -> Float[Array, "... 6"]:
     """Twist (w, rho) [..., 6], |w| <= pi, of a transform [..., 4, 4]; see ``so3.log``."""
     top = rows(as_floating(transform, (4, 4), "transform"))[:3]
     t = [row[3] for row in top]
@@ -81,7 +82,7 @@ def log(transform: ArrayLike) -> jax.Array:
     return from_entries([*w, *rho])
 
 
-def left_jacobian(xi: ArrayLike) -> jax.Array:
+def left_jacobian(xi: ArrayLike) -> Float[Array, "... 6 6"]:
     """[..., 6, 6] J with ``exp(xi + d) = exp(J d) exp(xi)`` to first order.
 
     ``[[J3, 0], [Q, J3]]`` with J3 the left Jacobian of SO(3) and Q(w, rho) of Barfoot, State
@@ -91,7 +92,7 @@ def left_jacobian(xi: ArrayLike) -> jax.Array:
     return _block_lower(so3.left_jacobian(w), _translation_block(w, rho))
 
 
-def left_jacobian_inverse(xi: ArrayLike) -> jax.Array:
+def left_jacobian_inverse(xi: ArrayLike) -> Float[Array, "... 6 6"]:
     """[..., 6, 6] inverse of ``left_jacobian``; singular at |w| = 2 pi, 4 pi, ... only."""
     w, rho = _split(xi)
     inverse = so3.left_jacobian_inverse(w)
@@ -99,19 +100,19 @@ def left_jacobian_inverse(xi: ArrayLike) -> jax.Array:
     return _block_lower(inverse, -block)
 
 
-def compose(a: ArrayLike, b: ArrayLike) -> jax.Array:
+def compose(a: ArrayLike, b: ArrayLike) -> Float[Array, "... 4 4"]:
     """Transform [..., 4, 4] that applies b first, then a."""
     return multiply(as_floating(a, (4, 4), "a"), as_floating(b, (4, 4), "b"))
 
 
-def inverse(transform: ArrayLike) -> jax.Array:
+def inverse(transform: ArrayLike) -> Float[Array, "... 4 4"]:
     """Inverse [..., 4, 4] of a rigid transform: ``[R^T | -R^T t]``."""
     transform = as_floating(transform, (4, 4), "transform")
     back = transpose(transform[..., :3, :3])
     return from_rt(back, -apply(back, transform[..., :3, 3]))
 
 
-def act(transform: ArrayLike, points: ArrayLike) -> jax.Array:
+def act(transform: ArrayLike, points: ArrayLike) -> Float[Array, "... N 3"]:
     """Moved points [..., N, 3]: ``R p + t``.
 
     Args:
@@ -123,14 +124,14 @@ def act(transform: ArrayLike, points: ArrayLike) -> jax.Array:
     return apply(transform[..., :3], points) + transform[..., 3]
 
 
-def adjoint(transform: ArrayLike) -> jax.Array:
+def adjoint(transform: ArrayLike) -> Float[Array, "... 6 6"]:
     """[..., 6, 6] Ad with ``T exp(xi) T^-1 = exp(Ad xi)``: ``[[R, 0], [hat(t) R, R]]``."""
     transform = as_floating(transform, (4, 4), "transform")
     rotation = transform[..., :3, :3]
     return _block_lower(rotation, multiply(so3.hat(transform[..., :3, 3]), rotation))
 
 
-def geodesic_distance(a: ArrayLike, b: ArrayLike) -> jax.Array:
+def geodesic_distance(a: ArrayLike, b: ArrayLike) -> Float[Array, "..."]:
     """Length [...] of the twist ``log(a^-1 b)``, one radian counting as much as one meter.
 
     Errors are reported as rotation and translation apart (``so3.geodesic_distance``); this is the
@@ -139,7 +140,7 @@ def geodesic_distance(a: ArrayLike, b: ArrayLike) -> jax.Array:
     return norm(log(compose(inverse(a), b)))
 
 
-def interpolate(a: ArrayLike, b: ArrayLike, fraction: ArrayLike) -> jax.Array:
+def interpolate(a: ArrayLike, b: ArrayLike, fraction: ArrayLike) -> Float[Array, "... 4 4"]:
     """Screw motion [..., 4, 4] from a (fraction 0) to b (fraction 1).
 
     Args:

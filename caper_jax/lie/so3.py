@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from caper_jax.lie.linalg import apply as apply
 from caper_jax.lie.linalg import (
@@ -64,21 +65,21 @@ _GENERATORS = np.array(
 _CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 
 
-def hat(w: ArrayLike) -> jax.Array:
+def hat(w: ArrayLike) -> Float[Array, "... 3 3"]:
     """Skew matrix [..., 3, 3] of a vector [..., 3]: ``hat(w) @ v == cross(w, v)``."""
     w = as_floating(w, (3,), "w")[..., None, None]
     x, y, z = _GENERATORS.astype(w.dtype)
     return w[..., 0, :, :] * x + w[..., 1, :, :] * y + w[..., 2, :, :] * z
 
 
-def vee(skew: ArrayLike) -> jax.Array:
+def vee(skew: ArrayLike) -> Float[Array, "... 3"]:
     """Vector [..., 3] of a skew matrix [..., 3, 3]; of another matrix, of its skew part."""
     m = as_floating(skew, (3, 3), "skew")
     pairs = ((2, 1), (0, 2), (1, 0))
     return jnp.stack([(m[..., i, j] - m[..., j, i]) / 2 for i, j in pairs], axis=-1)
 
 
-def exp(w: ArrayLike) -> jax.Array:
+def exp(w: ArrayLike) -> Float[Array, "... 3 3"]:
     """Rotation matrix [..., 3, 3] of a rotation vector [..., 3] (Rodrigues' formula).
 
     Args:
@@ -113,7 +114,7 @@ def _exp_jvp(primals, tangents):
     return rotation, _columns(columns)
 
 
-def log(rotation: ArrayLike) -> jax.Array:
+def log(rotation: ArrayLike) -> Float[Array, "... 3"]:
     """Rotation vector [..., 3], of length at most pi, of a rotation matrix [..., 3, 3].
 
     At exactly pi the vector and its negative are the same rotation, and either may be returned.
@@ -178,21 +179,21 @@ def _twice_across(w, v, first, second) -> list[jax.Array]:
     return [v[i] + first * once[i] + second * twice[i] for i in range(3)]
 
 
-def left_jacobian(w: ArrayLike) -> jax.Array:
+def left_jacobian(w: ArrayLike) -> Float[Array, "... 3 3"]:
     """[..., 3, 3] J with ``exp(w + d) = exp(J d) exp(w)`` to first order; V of SE(3) alike."""
     w = as_floating(w, (3,), "w")
     _, first, second = exp_coefficients(trigonometry(entries(w)))
     return rodrigues(w, first, second)
 
 
-def left_jacobian_inverse(w: ArrayLike) -> jax.Array:
+def left_jacobian_inverse(w: ArrayLike) -> Float[Array, "... 3 3"]:
     """[..., 3, 3] inverse of ``left_jacobian``; singular at |w| = 2 pi, 4 pi, ... only."""
     w = as_floating(w, (3,), "w")
     _, second = inverse_coefficients(trigonometry(entries(w)))
     return rodrigues(w, jnp.full_like(second, -0.5), second)
 
 
-def angle(rotation: ArrayLike) -> jax.Array:
+def angle(rotation: ArrayLike) -> Float[Array, "..."]:
     """Rotation angle [...] in [0, pi] radians of [..., 3, 3]; its derivative at 0 is taken as 0.
 
     2 atan2(|v|, r) of the quaternion (r, v) keeps seven digits in float32 at every angle, where
@@ -202,14 +203,16 @@ def angle(rotation: ArrayLike) -> jax.Array:
     return 2 * jnp.arctan2(norm(from_entries(vector)), real)
 
 
-def geodesic_distance(rotation_a: ArrayLike, rotation_b: ArrayLike) -> jax.Array:
+def geodesic_distance(rotation_a: ArrayLike, rotation_b: ArrayLike) -> Float[Array, "..."]:
     """Angle [...] in radians of the rotation that takes one [..., 3, 3] to the other."""
     a = as_floating(rotation_a, (3, 3), "rotation_a")
     b = as_floating(rotation_b, (3, 3), "rotation_b")
     return angle(multiply(transpose(a), b))
 
 
-def interpolate(rotation_a: ArrayLike, rotation_b: ArrayLike, fraction: ArrayLike) -> jax.Array:
+def interpolate(
+    rotation_a: ArrayLike, rotation_b: ArrayLike, fraction: ArrayLike
+) -> Float[Array, "... 3 3"]:
     """Point [..., 3, 3] on the shortest path from a (fraction 0) to b (fraction 1).
 
     Args:
@@ -318,7 +321,7 @@ def _inverse_coefficient_slopes(
     return slope_first, jnp.where(small, _horner(weighted, x), closed)
 
 
-def rodrigues(vector: jax.Array, first: jax.Array, second: jax.Array) -> jax.Array:
+def rodrigues(vector: jax.Array, first: jax.Array, second: jax.Array) -> Float[Array, "... 3 3"]:
     """``I + first hat(v) + second hat(v)^2`` [..., 3, 3] of v [..., 3] and two scalars [...]."""
     v = entries(vector)
     matrix = _off_diagonal(v, first, second)

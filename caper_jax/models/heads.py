@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import flax.linen as nn
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from caper_jax.config import HeadConfig
 from caper_jax.models.encoders.features import BlockDense, Features
-from caper_jax.models.layers import BatchNorm, Dense, max_over_points, product, weights_first
+from caper_jax.models.layers import (
+    BatchNorm,
+    Dense,
+    max_over_points,
+    mixed_precision_dot,
+    weights_first,
+)
 
 
 def _norm_relu(features, train: bool):
@@ -16,7 +23,7 @@ def _norm_relu(features, train: bool):
 
 def _pointwise(features: Features, first: int, second: int, with_points: bool, train: bool):
     """The two layers at every point, [B, N, second]."""
-    dot_general = weights_first if train else product
+    dot_general = weights_first if train else mixed_precision_dot
     hidden = BlockDense(first, with_points, dot_general)(features)
     return _norm_relu(Dense(second, dot_general=dot_general)(_norm_relu(hidden, train)), train)
 
@@ -35,8 +42,8 @@ class PooledHead(nn.Module):
     with_points: bool = False
 
     @nn.compact
-    def __call__(self, features: Features, train: bool):
-        """Features -> [B, outputs]."""
+    def __call__(self, features: Features, train: bool) -> Float[Array, "B D"]:
+        """Features -> ``outputs`` numbers per cloud."""
         first, second, third = self.config.widths
         if self.config.pool_first:
             rows = features.levels[-1].features
@@ -65,15 +72,15 @@ class PointHead(nn.Module):
     config: HeadConfig
 
     @nn.compact
-    def __call__(self, features: Features, train: bool):
-        """Features -> [B, N, outputs]."""
+    def __call__(self, features: Features, train: bool) -> Float[Array, "B N D"]:
+        """Features -> ``outputs`` numbers per point."""
         first, second, _ = self.config.widths
         hidden = _pointwise(features, first, second, True, train)
         hidden = nn.Dropout(self.config.dropout, deterministic=not train)(hidden)
         return Dense(self.outputs)(hidden)
 
 
-def unit_vectors(raw):
-    """[..., 3] -> unit vectors; the slope stays finite at zero, where the result is zero."""
+def unit_vectors(raw: Float[Array, "*batch D"]) -> Float[Array, "*batch D"]:
+    """Unit vectors; the slope stays finite at zero, where the result is zero."""
     squared = (raw * raw).sum(-1, keepdims=True)
     return raw / jnp.sqrt(squared + 1e-12)

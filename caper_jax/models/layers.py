@@ -1,8 +1,7 @@
-"""Dense layer and batch norm of Flax, traced without evaluating their initializers again; a product
-whose backward pass lets go of its input early; and a maximum whose slope is finite everywhere.
+"""Layers of the networks: Flax's dense layer and batch norm, products, and a maximum over points.
 
-Flax compares every weight with its initializer's output, traced anew, at each use. That is a third
-of the time to a first pose; the shape is an argument of the initializer, and is compared here.
+One product is in mixed precision, one frees its input early in the backward pass; the slope of the
+maximum is finite everywhere.
 """
 
 from __future__ import annotations
@@ -14,11 +13,12 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float, Shaped
 
 from caper_jax.errors import CaperError
 
 
-def after(done: jax.Array, array: jax.Array) -> jax.Array:
+def after(done: Shaped[Array, ""], array: Shaped[Array, "..."]) -> Shaped[Array, "..."]:
     """``array``, but not computed before ``done``, a number, is known; NaN unless that is finite.
 
     XLA keeps no order between what does not depend on each other, and drops barriers on a CPU.
@@ -32,8 +32,8 @@ _TIE = 80
 
 
 @jax.custom_jvp
-def max_over_points(features):
-    """[B, N, C] -> [B, C] maximum; entries that reach it share its gradient, as in JAX.
+def max_over_points(features: Float[Array, "B N C"]) -> Float[Array, "B C"]:
+    """The maximum over points; entries that reach it share its gradient, as in JAX.
 
     JAX divides by the number of entries that equal the maximum. Where the compiler computes them
     a second time with other rounding, that is none, and the gradient is NaN.
@@ -54,7 +54,7 @@ def _max_over_points_jvp(primals, tangents):
 _WIDE = 64  # input channels, from which a product is worth rounding
 
 
-def product(inputs, kernel, dimensions, precision=None):
+def mixed_precision_dot(inputs, kernel, dimensions, precision=None):
     """``lax.dot_general``, rounded under ``jax.default_matmul_precision("bfloat16")``.
 
     JAX leaves that setting to the backend, and a CPU ignores it. Here it rounds the factors of the
@@ -72,12 +72,12 @@ def product(inputs, kernel, dimensions, precision=None):
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def weights_first(inputs, kernel, dimensions, precision=None):
-    """``product`` of [..., C] and [C, D] that backpropagates to the kernel first.
+    """``mixed_precision_dot`` of [..., C] and [C, D] that backpropagates to the kernel first.
 
     The inputs, often the largest arrays of a step, are then gone before the gradient goes on to
     what they were computed from. In reverse mode only. For ``Dense(dot_general=...)``.
     """
-    return product(inputs, kernel, dimensions, precision)
+    return mixed_precision_dot(inputs, kernel, dimensions, precision)
 
 
 def _weights_first_forward(inputs, kernel, dimensions, precision):
@@ -101,7 +101,11 @@ weights_first.defvjp(_weights_first_forward, _weights_first_backward)
 
 
 class Weights:
-    """Before ``nn.Module`` in the bases: ``param`` runs no initializer for its shape alone."""
+    """Mixin, before ``nn.Module`` in the bases: ``param`` runs no initializer for its shape alone.
+
+    Flax traces every weight's initializer again at each use, to compare shapes: a third of the time
+    to a first pose. Here the shape, an argument of the initializer, is compared.
+    """
 
     def param(self: Any, name: str, init_fn: Any, *init_args: Any, **options: Any) -> Any:
         """As ``nn.Module.param`` for ``init_fn(key, shape, dtype)``.
@@ -126,9 +130,9 @@ class Weights:
 
 
 class Dense(Weights, nn.Dense):
-    """``nn.Dense``, its product by ``product``."""
+    """``nn.Dense`` by ``mixed_precision_dot``."""
 
-    dot_general: Any = product
+    dot_general: Any = mixed_precision_dot
 
 
 class BatchNorm(Weights, nn.BatchNorm):

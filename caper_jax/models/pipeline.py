@@ -1,4 +1,8 @@
-"""Both stages on clouds: points -> root pose -> canonical cloud -> joints and boxes (Sec 5)."""
+"""Both stages on clouds: points -> root pose -> canonical cloud -> joints and boxes (Sec 5).
+
+Networks work in the viewing frame (``geometry.frames.view_rotation``) and in network units, meters
+times ``Category.unit``.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
@@ -17,11 +22,11 @@ from caper_jax.geometry.raster_order import from_raster_order, raster_order, to_
 from caper_jax.geometry.two_axis_rotation import rotation_from_directions
 from caper_jax.lie import se3
 from caper_jax.models import uncertainty
-from caper_jax.models.increment import increment_transform
-from caper_jax.models.networks import PartsNetwork, RootNetwork, shared_neighborhoods
+from caper_jax.models.encoders import shared_neighborhoods
+from caper_jax.models.parts import PartsNetwork, increment_transform, vote
 from caper_jax.models.refiner import BoxRefiner, StageEstimate, apply_residual, refiner_features
+from caper_jax.models.root import RootNetwork
 from caper_jax.models.rotation_classes import rotate_pose, select_rotation
-from caper_jax.models.voting import vote
 
 # Part sizes are residuals to a mean; nothing else keeps a regression from going below zero.
 SMALLEST_SIZE = 0.01  # of the mean
@@ -29,29 +34,32 @@ SMALLEST_SIZE = 0.01  # of the mean
 
 @flax.struct.dataclass
 class StageOutputs:
-    """What both stages say of a batch of clouds, viewing frame, network units.
+    """Outputs of both stages for a batch of clouds, viewing frame, network units.
 
     Attributes:
-      reading: boxes, pose and joints.
-      segmentation: [B, N, K] logits.
-      confidence, degenerate, evidence: see ``Prediction``.
+      estimate: pose, joints and boxes.
+      segmentation: logits.
+      confidence, degenerate, evidence: see ``estimator.Prediction``.
     """
 
-    reading: StageEstimate
-    segmentation: Any
-    confidence: Any
-    degenerate: Any
-    evidence: Any
+    estimate: StageEstimate
+    segmentation: Float[Array, "B N K"]
+    confidence: Float[Array, "B 2"]
+    degenerate: Bool[Array, "B"]
+    evidence: Float[Array, "B K E"]
 
 
-def read(
-    variables: dict[str, Any], cloud, category: Category, network: NetworkConfig
+def run_stages(
+    variables: dict[str, Any],
+    cloud: Float[Array, "B N 3"],
+    category: Category,
+    network: NetworkConfig,
 ) -> StageOutputs:
-    """Both stages, before the sides of the boxes correct what they found.
+    """Both stages, without the refiner.
 
     Args:
-      variables: see ``estimate``.
-      cloud: [B, N, 3] viewing frame, network units; in any order.
+      variables: see ``estimator.estimate``.
+      cloud: viewing frame, network units; in any order.
       category, network: static.
     """
 
@@ -73,22 +81,22 @@ def read(
     )
     pose = se3.from_rt(rotation, root.translation)
     parts_network = PartsNetwork(network, category.num_parts)
-    uncorrected = pose
+    unrefined = pose
     for _ in range(network.refine_steps):
         canonical = canonicalize(cloud, pose[:, :3, :3], pose[:, :3, 3])
         output = apply("parts", parts_network, canonical)
-        if output.turn is not None:
+        if output.rotation_class is not None:
             pose = rotate_pose(
-                pose, select_rotation(output.turn, network.rotation_classifier.margin)
+                pose, select_rotation(output.rotation_class, network.rotation_classifier.margin)
             )
         pose = se3.compose(pose, increment_transform(output.increment, network.increment))
     canonical = canonicalize(cloud, pose[:, :3, :3], pose[:, :3, 3])
     parts = apply("parts", parts_network, canonical)
     axis, pivot = vote(canonical, parts.heatmap, parts.offset, parts.direction)
     mean_size = jnp.asarray(category.mean_size, cloud.dtype) * unit
-    moved = se3.log(se3.compose(se3.inverse(uncorrected), pose))
+    moved = se3.log(se3.compose(se3.inverse(unrefined), pose))
     return StageOutputs(
-        reading=StageEstimate(
+        estimate=StageEstimate(
             root=pose,
             axis=axis,
             pivot=pivot,
@@ -105,50 +113,56 @@ def read(
 
 def refinements(
     variables: dict[str, Any],
-    found: StageOutputs,
-    cloud,
+    outputs: StageOutputs,
+    cloud: Float[Array, "B N 3"],
     category: Category,
     network: NetworkConfig,
 ) -> list[StageEstimate]:
-    """What both stages found, and what each pass over the sides of its boxes makes of it.
+    """The estimate of both stages, and what each iteration of the refiner makes of it.
 
     Args:
       variables: see ``estimator.estimate``.
-      found: by ``read`` in this cloud.
-      cloud: [B, N, 3] viewing frame, network units.
+      outputs: of ``run_stages`` for this cloud.
+      cloud: viewing frame, network units.
       category, network: static.
     """
-    stages = [found.reading]
+    estimates = [outputs.estimate]
     if network.refiner.width:
         module = BoxRefiner(network.refiner.width, category.num_parts)
         own = {"params": variables["params"]["refiner"]}
         for _ in range(network.refiner.iterations):
-            output: Any = module.apply(own, refiner_inputs(found, stages[-1], cloud, category))
-            stages.append(apply_residual(stages[-1], output))
-    return stages
+            residual: Any = module.apply(
+                own, refiner_inputs(outputs, estimates[-1], cloud, category)
+            )
+            estimates.append(apply_residual(estimates[-1], residual))
+    return estimates
 
 
-def refiner_inputs(found: StageOutputs, reading: StageEstimate, cloud, category: Category):
-    """``refiner.refiner_features`` [B, F] of an estimate of a cloud with these stage outputs."""
-    share = jax.nn.softmax(found.segmentation)
-    return refiner_features(reading, cloud, share, found.evidence[:, 0], category)
+def refiner_inputs(
+    outputs: StageOutputs, estimate: StageEstimate, cloud: Float[Array, "B N 3"], category: Category
+) -> Float[Array, "B F"]:
+    """``refiner.refiner_features`` of an estimate of a cloud with these stage outputs."""
+    share = jax.nn.softmax(outputs.segmentation)
+    return refiner_features(estimate, cloud, share, outputs.evidence[:, 0], category)
 
 
-def articulated_pose(reading: StageEstimate, view, category: Category) -> ArticulatedPose:
-    """A reading as the camera sees it, in meters.
+def articulated_pose(
+    estimate: StageEstimate, view: Float[Array, "B 3 3"], category: Category
+) -> ArticulatedPose:
+    """An estimate in the camera frame, in meters.
 
     Args:
-      reading: viewing frame, network units.
-      view: [B, 3, 3] camera -> viewing frame.
+      estimate: viewing frame, network units.
+      view: camera -> viewing frame.
       category: static.
     """
     unit, back = category.unit, transpose(view)
-    state_units = jnp.asarray(category.state_units, reading.state.dtype)
-    pivot, state = reading.pivot / unit, reading.state / state_units
-    translation = rotate(back, reading.root[:, None, :3, 3])[:, 0] / unit
+    state_units = jnp.asarray(category.state_units, estimate.state.dtype)
+    pivot, state = estimate.pivot / unit, estimate.state / state_units
+    translation = rotate(back, estimate.root[:, None, :3, 3])[:, 0] / unit
     poses = forward_kinematics(
-        se3.from_rt(multiply(back, reading.root[:, :3, :3]), translation),
-        reading.axis,
+        se3.from_rt(multiply(back, estimate.root[:, :3, :3]), translation),
+        estimate.axis,
         pivot,
         state,
         category.joint_types,
@@ -157,9 +171,9 @@ def articulated_pose(reading: StageEstimate, view, category: Category) -> Articu
     return ArticulatedPose(
         rotation=poses[..., :3, :3],
         translation=poses[..., :3, 3],
-        size=reading.size / unit,
-        box_center=reading.center / unit,
-        joint_axis=reading.axis,
+        size=estimate.size / unit,
+        box_center=estimate.center / unit,
+        joint_axis=estimate.axis,
         joint_pivot=pivot,
         joint_state=state,
     )

@@ -1,4 +1,4 @@
-"""The last correction of an estimate, from the sides of its boxes (ours, not in the paper).
+"""The refiner: the last correction of an estimate, from the sides of its boxes (not in the paper).
 
 What the encoders pool says how large a part is to some percent, while its points lie on the very
 sides of its box. Here every part's cloud is put into the box that was estimated for it. How it is
@@ -8,15 +8,15 @@ small network how far box, pose and joints are off.
 
 from __future__ import annotations
 
-from typing import Any
-
 import flax.linen as nn
 import flax.struct
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
+from caper_jax.articulation.pose import Array
 from caper_jax.lie import se3
 from caper_jax.models.layers import Dense, Weights
 from caper_jax.models.uncertainty import EVIDENCE
@@ -34,44 +34,44 @@ _MOST = 0.7  # of the logarithm of a size
 
 @flax.struct.dataclass
 class StageEstimate:
-    """What both stages found, in the viewing frame and network units.
+    """The estimate of both stages, in the viewing frame and network units.
 
     Attributes:
-      root: [B, 4, 4] pose.
-      axis, pivot: [B, J, 3] in the root's canonical frame.
-      state: [B, J] radians, or network units for prismatic joints.
-      size, center: [B, K, 3] of the parts' boxes, each in its part's canonical frame.
+      root: pose of the root.
+      axis, pivot: in the root's canonical frame.
+      state: radians, or network units for prismatic joints.
+      size, center: of the parts' boxes, each in its part's canonical frame.
     """
 
-    root: Any
-    axis: Any
-    pivot: Any
-    state: Any
-    size: Any
-    center: Any
+    root: Float[Array, "B 4 4"]
+    axis: Float[Array, "B J 3"]
+    pivot: Float[Array, "B J 3"]
+    state: Float[Array, "B J"]
+    size: Float[Array, "B K 3"]
+    center: Float[Array, "B K 3"]
 
 
 @flax.struct.dataclass
 class RefinerOutput:
-    """By how much a reading is off.
+    """By how much an estimate is off.
 
     Attributes:
-      size: [B, K, 3] logarithm of the true size over the estimated one.
-      center: [B, K, 3] in estimated sizes.
-      twist: [B, 6] root increment, network units.
-      pivot: [B, J, 3] network units.
-      state: [B, J] as in ``StageEstimate``.
+      size: logarithm of the true size over the estimated one.
+      center: in estimated sizes.
+      twist: root increment, network units.
+      pivot: network units.
+      state: as in ``StageEstimate``.
     """
 
-    size: Any
-    center: Any
-    twist: Any
-    pivot: Any
-    state: Any
+    size: Float[Array, "B K 3"]
+    center: Float[Array, "B K 3"]
+    twist: Float[Array, "B 6"]
+    pivot: Float[Array, "B J 3"]
+    state: Float[Array, "B J"]
 
 
 class BoxRefiner(Weights, nn.Module):
-    """Features of a reading -> RefinerOutput.
+    """Features of an estimate -> RefinerOutput.
 
     Attributes:
       width: channels of its two hidden layers.
@@ -82,8 +82,8 @@ class BoxRefiner(Weights, nn.Module):
     num_parts: int
 
     @nn.compact
-    def __call__(self, features):
-        """[B, F] as ``refiner_features`` gives them; says zero before it was fitted."""
+    def __call__(self, features: Float[Array, "B F"]) -> RefinerOutput:
+        """Features as ``refiner_features`` gives them; all zeros before it was fitted."""
         parts, joints = self.num_parts, self.num_parts - 1
         shape = features.shape[-1:]
         mean = self.param("mean", nn.initializers.zeros, shape)
@@ -109,31 +109,34 @@ def num_features(num_parts: int) -> int:
     return num_parts * of_a_part + 3 + (num_parts - 1) + EVIDENCE
 
 
-def refiner_features(reading: StageEstimate, cloud, share, evidence, category: Category):
-    """What the points say about the boxes of a reading.
+def refiner_features(
+    estimate: StageEstimate,
+    cloud: Float[Array, "B N 3"],
+    share: Float[Array, "B N K"],
+    evidence: Float[Array, "B E"],
+    category: Category,
+) -> Float[Array, "B F"]:
+    """How the points lie in the boxes of an estimate.
 
     Args:
-      reading: of both stages.
-      cloud: [B, N, 3] viewing frame, network units.
-      share: [B, N, K] how much each point is each part's; sums to one over parts.
-      evidence: [B, EVIDENCE] of the frame (``confidence.evidence``).
+      estimate: of both stages.
+      cloud: viewing frame, network units.
+      share: how much each point belongs to each part; sums to one over parts.
+      evidence: of the frame (``uncertainty.evidence``).
       category: static.
-
-    Returns:
-      [B, F].
     """
     batch = cloud.shape[0]
     parts = forward_kinematics(
-        reading.root,
-        reading.axis,
-        reading.pivot,
-        reading.state,
+        estimate.root,
+        estimate.axis,
+        estimate.pivot,
+        estimate.state,
         category.joint_types,
         category.parents,
     )
     away = cloud[:, :, None] - parts[:, None, :, :3, 3]
     own = (away[..., :, None] * parts[:, None, :, :3, :3]).sum(-2)  # R^T (p - t)
-    inside = (own - reading.center[:, None]) / (0.5 * reading.size[:, None])  # [B, N, K, 3]
+    inside = (own - estimate.center[:, None]) / (0.5 * estimate.size[:, None])  # [B, N, K, 3]
 
     count = share.sum(1)  # [B, K]
     weight = share / (share.sum(1, keepdims=True) + 1.0)
@@ -142,12 +145,11 @@ def refiner_features(reading: StageEstimate, cloud, share, evidence, category: C
     tilts = [_tilt(inside, share, side) for side in (-1.0, 1.0)]
 
     mean_size = jnp.asarray(category.mean_size, cloud.dtype) * category.unit
-    sight = (cloud.mean(1)[:, :, None] * reading.root[:, :3, :3]).sum(1)  # from the root's frame
-    known = [
-        *(spread, *tilts, jnp.log(count + 1.0), sight),
-        *(jnp.log(reading.size / mean_size), reading.center / mean_size, reading.state, evidence),
-    ]
-    return jnp.concatenate([values.reshape(batch, -1) for values in known], axis=-1)
+    sight = (cloud.mean(1)[:, :, None] * estimate.root[:, :3, :3]).sum(1)  # from the root's frame
+    of_points = (spread, *tilts, jnp.log(count + 1.0), sight)
+    box = (jnp.log(estimate.size / mean_size), estimate.center / mean_size)
+    features = (*of_points, *box, estimate.state, evidence)
+    return jnp.concatenate([values.reshape(batch, -1) for values in features], axis=-1)
 
 
 def _tilt(inside, share, side: float):
@@ -156,25 +158,25 @@ def _tilt(inside, share, side: float):
     # Points last: sums over them are then several times as fast on a CPU.
     inside, share = jnp.moveaxis(inside, 1, -1), jnp.moveaxis(share, 1, -1)[:, :, None]
     near = share * jnp.exp(-jnp.square((inside - side) / _BAND))  # [B, K, 3, N]
-    sure = near.sum(-1) + 1e-3
-    shift = (near * (inside - side)).sum(-1) / sure
+    total = near.sum(-1) + 1e-3
+    shift = (near * (inside - side)).sum(-1) / total
     slopes = []
     for other in (1, 2):
         along = jnp.roll(inside, -other, axis=2)
-        along = along - ((near * along).sum(-1) / sure)[..., None]
+        along = along - ((near * along).sum(-1) / total)[..., None]
         together = (near * (inside - side - shift[..., None]) * along).sum(-1)
-        slopes.append(3.0 * together / ((near * jnp.square(along)).sum(-1) + 0.02 * sure))
-    return jnp.stack([jnp.log(sure), shift, *slopes], axis=-1)
+        slopes.append(3.0 * together / ((near * jnp.square(along)).sum(-1) + 0.02 * total))
+    return jnp.stack([jnp.log(total), shift, *slopes], axis=-1)
 
 
-def apply_residual(reading: StageEstimate, output: RefinerOutput) -> StageEstimate:
-    """The reading without what the network says it is off by."""
+def apply_residual(estimate: StageEstimate, output: RefinerOutput) -> StageEstimate:
+    """The estimate corrected by what the refiner says it is off by."""
     growth = jnp.exp(jnp.clip(output.size, -_MOST, _MOST))
     return StageEstimate(
-        root=se3.compose(reading.root, se3.exp(output.twist)),
-        axis=reading.axis,
-        pivot=reading.pivot + output.pivot,
-        state=reading.state + output.state,
-        size=reading.size * growth,
-        center=reading.center + output.center * reading.size,
+        root=se3.compose(estimate.root, se3.exp(output.twist)),
+        axis=estimate.axis,
+        pivot=estimate.pivot + output.pivot,
+        state=estimate.state + output.state,
+        size=estimate.size * growth,
+        center=estimate.center + output.center * estimate.size,
     )

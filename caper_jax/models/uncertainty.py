@@ -1,4 +1,4 @@
-"""How sure an estimate is: standard deviations, calibrated on frames that training never saw.
+"""Uncertainty of an estimate: standard deviations, calibrated on frames that training never saw.
 
 Beyond the paper, whose correction factors (Eq 18) say how good the two directions of the root are
 and nothing of the other parts. What the networks say about a frame anyway, its evidence, gives for
@@ -16,6 +16,8 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
 
 from caper_jax.errors import CaperError
 from caper_jax.lie import linalg
@@ -33,29 +35,31 @@ class Calibration:
     """Coefficients of a category: log radius = evidence @ [..., :-1] + [..., -1].
 
     Attributes:
-      rotation: [K, EVIDENCE + 1] radians.
-      translation: [K, EVIDENCE + 1] network units.
-      state: [J, EVIDENCE + 1] radians or network units.
-      low, high: [EVIDENCE] range of the evidence it was fitted on, beyond which nothing changes.
+      rotation: radians; one column more than the evidence has, E = EVIDENCE + 1.
+      translation: network units.
+      state: radians or network units.
+      low, high: range of the evidence it was fitted on, beyond which nothing changes.
     """
 
-    rotation: Any
-    translation: Any
-    state: Any
-    low: Any
-    high: Any
+    rotation: Float[np.ndarray, "K E"]
+    translation: Float[np.ndarray, "K E"]
+    state: Float[np.ndarray, "J E"]
+    low: Float[np.ndarray, "E-1"]
+    high: Float[np.ndarray, "E-1"]
 
 
-def evidence(confidence, increment, logits):
-    """What the networks say about a frame that goes with the errors of its estimate.
+def evidence(
+    confidence: Float[Array, "B 2"], increment: Float[Array, "B 6"], logits: Float[Array, "B N K"]
+) -> Float[Array, "B K E"]:
+    """Numbers of the networks that go along with the errors of an estimate.
 
     Args:
-      confidence: [B, 2] in (0, 1), Eq 18.
-      increment: [B, 6] twist by which stage II corrected the root.
-      logits: [B, N, K] of the segmentation.
+      confidence: of the root's directions, in (0, 1), Eq 18.
+      increment: twist by which stage II corrected the root.
+      logits: of the segmentation.
 
     Returns:
-      [B, K, EVIDENCE]: logarithms of the doubt about each direction, of both halves of the twist
+      For each part the logarithms of the doubt about each direction, of both halves of the twist
       and of the part's share of the points, and the mean entropy of the segmentation.
     """
     doubt = jnp.log(1.0 - confidence + _FLOOR)
@@ -63,25 +67,26 @@ def evidence(confidence, increment, logits):
     moved = jnp.log(linalg.norm(halves) + _FLOOR)
     log_share = jax.nn.log_softmax(logits)
     entropy = -(jnp.exp(log_share) * log_share).sum(-1).mean(-1)
-    count = points_of_parts(logits.argmax(-1), logits.shape[-1])
-    seen = jnp.log((count + 1.0) / logits.shape[1])
+    count = points_per_part(logits.argmax(-1), logits.shape[-1])
+    visible = jnp.log((count + 1.0) / logits.shape[1])
     frame = jnp.concatenate([doubt, moved, entropy[:, None]], -1)
-    frame = jnp.broadcast_to(frame[:, None], (*seen.shape, frame.shape[-1]))
-    return jnp.concatenate([frame, seen[..., None]], -1)
+    frame = jnp.broadcast_to(frame[:, None], (*visible.shape, frame.shape[-1]))
+    return jnp.concatenate([frame, visible[..., None]], -1)
 
 
-def points_of_parts(labels, num_parts: int):
-    """[B, K] int32, how many of the points show each part."""
+def points_per_part(labels: Int[Array, "B N"], num_parts: int) -> Int[Array, "B K"]:
+    """How many of the points show each part."""
     return (labels[..., None] == jnp.arange(num_parts)).sum(-2, dtype=jnp.int32)
 
 
-def radii(calibration: Calibration, found):
-    """Radii that hold the truth nine times in ten, from evidence [B, K, EVIDENCE].
+def radii(
+    calibration: Calibration, evidence: Float[Array, "B K E"]
+) -> tuple[Float[Array, "B K"], Float[Array, "B K"], Float[Array, "B J"]]:
+    """Radii that hold the truth nine times in ten: rotation, translation and joint state.
 
-    Returns:
-      (rotation [B, K], translation [B, K], state [B, J]), units as in ``Calibration``.
+    Units are those of ``Calibration``.
     """
-    inside = jnp.clip(found, calibration.low, calibration.high)
+    inside = jnp.clip(evidence, calibration.low, calibration.high)
 
     def linear(coefficients, parts):
         return jnp.exp((parts * coefficients[:, :-1]).sum(-1) + coefficients[:, -1])
@@ -93,8 +98,10 @@ def radii(calibration: Calibration, found):
     )
 
 
-def pose_covariance(rotation_std, translation_std):
-    """[..., 6, 6] of the twist xi in T_true = T exp(xi), from standard deviations [...].
+def pose_covariance(
+    rotation_std: Float[ArrayLike, "*batch"], translation_std: Float[ArrayLike, "*batch"]
+) -> Float[Array, "*batch 6 6"]:
+    """Covariance of the twist xi in T_true = T exp(xi), from standard deviations.
 
     Rotation first, as everywhere; isotropic in both halves, without correlation.
     """

@@ -23,7 +23,7 @@ from caper_jax.data.images import read_json
 from caper_jax.data.readers.artimage_models import POINTS, REST_STATES
 from caper_jax.data.readers.public_urdf import ALIGNED, POINT_ORDER, RAW
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.render import Image
 from caper_jax.synthetic.surface import surface_points
 

@@ -12,8 +12,7 @@ import numpy as np
 
 from caper_jax.articulation.category import Category, ObjectModel
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solid_bounds import bounds
-from caper_jax.geometry.solids import TAPERED, Kind, Solid
+from caper_jax.geometry.solids import TAPERED, Kind, Solid, bounds
 
 # Splits never share an instance: each draws from its own family of seeds.
 SPLITS = {"train": 0, "val": 1, "test": 2}

@@ -6,8 +6,7 @@ import itertools
 
 import numpy as np
 
-from caper_jax.geometry.solid_bounds import corners_after_cut
-from caper_jax.geometry.solids import Solid
+from caper_jax.geometry.solids import Solid, corners_after_cut
 
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 

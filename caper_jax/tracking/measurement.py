@@ -1,29 +1,32 @@
-"""Where the object is in one frame, as the networks see it: on the track, or from nothing."""
+"""Where the object is in one frame: by the networks, on the track or from nothing, or as given."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from caper_jax.articulation.category import Category
+from caper_jax.articulation.pose import Array as AnyArray
 from caper_jax.config import NetworkConfig
 from caper_jax.estimator import estimate
 from caper_jax.geometry.frames import canonicalize
 from caper_jax.geometry.raster_order import from_raster_order, raster_order, to_raster_order
-from caper_jax.lie import linalg, se3
-from caper_jax.models.increment import increment_transform
-from caper_jax.models.networks import PartsNetwork
+from caper_jax.lie import linalg, se3, so3
+from caper_jax.models.parts import PartsNetwork, increment_transform, vote
 from caper_jax.models.rotation_classes import NUM_CUBE_ROTATIONS, log_odds
-from caper_jax.models.voting import vote
 from caper_jax.tracking.registration import JointTree, part_poses
 from caper_jax.tracking.state import ObjectParameters, of_type
 
-_NO_TURN = np.zeros(NUM_CUBE_ROTATIONS, np.float32)
+_NO_ROTATION = np.zeros(NUM_CUBE_ROTATIONS, np.float32)
 _MEMORY = 60.0  # frames over which joint parameters and sizes are averaged
+# Motion from rest at which a pose tells as much about its joint as one frame's votes do.
+_TURN, _SLIDE, _PIVOT = 0.1, 0.1, 0.1
 
 
 @flax.struct.dataclass
@@ -35,19 +38,19 @@ class PoseMeasurement:
       joint_state: [J].
       parts: [K, 4, 4] part poses in the root's frame.
       labels: [N] int32 part of every point.
-      constants: joint parameters and sizes.
-      sure: [] in [0, 1], the lesser confidence of the root's two directions (Eq 18); 1 of a track.
-      turn: [24] log odds that the reference is off by each rotation of
-        ``models.rotation_classes``; zero where nothing says so.
+      parameters: joint parameters and sizes.
+      confidence: [] in [0, 1], the lower one of the root's two directions (Eq 18); 1 of a track.
+      rotation_log_odds: [24] log odds that the reference is off by each rotation of
+        ``models.rotation_classes``; zero without evidence.
     """
 
-    root: Any
-    joint_state: Any
-    parts: Any
-    labels: Any
-    constants: ObjectParameters
-    sure: Any
-    turn: Any
+    root: Float[Array, "4 4"]
+    joint_state: Float[Array, "J"]
+    parts: Float[Array, "K 4 4"]
+    labels: Int[Array, "N"]
+    parameters: ObjectParameters
+    confidence: Float[Array, ""]
+    rotation_log_odds: Float[AnyArray, "24"]
 
 
 def measure(
@@ -73,87 +76,137 @@ def measure(
     segmentation = from_raster_order(output.segmentation, order)[0]
     predicted = segmentation.argmax(-1).astype(jnp.int32)
     unit = category.unit
-    constants = ObjectParameters(
+    parameters = ObjectParameters(
         axis=axis[0],
         pivot=pivot[0],
         size=jnp.asarray(category.mean_size) * unit + output.size[0],
         center=jnp.asarray(category.mean_center) * unit + output.center[0],
-        seen=jnp.asarray(1.0),
+        num_frames=jnp.asarray(1.0),
         known=jnp.zeros(category.num_joints),
     )
     tree = JointTree(axis[0], pivot[0], category.joint_types, category.parents)
-    fix = PoseMeasurement(
+    measurement = PoseMeasurement(
         root=se3.compose(reference, increment),
         joint_state=output.state[0],
         parts=part_poses(tree, output.state[0]),
         labels=jnp.where(labels >= 0, labels, predicted),
-        constants=constants,
-        sure=jnp.asarray(1.0, points.dtype),
-        turn=_NO_TURN if output.turn is None else log_odds(output.turn[0]),
+        parameters=parameters,
+        confidence=jnp.asarray(1.0, points.dtype),
+        rotation_log_odds=(
+            _NO_ROTATION if output.rotation_class is None else log_odds(output.rotation_class[0])
+        ),
     )
-    return of_type(fix, points.dtype)
+    return of_type(measurement, points.dtype)
 
 
 def estimate_measurement(
     variables, points, labels, category: Category, network: NetworkConfig
 ) -> PoseMeasurement:
-    """The static estimator's answer; arguments as for ``measure``."""
+    """The pose that the single-frame estimator gives; arguments as for ``measure``."""
     unit = category.unit
     prediction = estimate(variables, points[None] / unit, category, network)
     pose = jax.tree.map(lambda array: array[0], prediction.pose)
     poses = se3.from_rt(pose.rotation, pose.translation * unit)
-    fix = PoseMeasurement(
+    measurement = PoseMeasurement(
         root=poses[0],
         joint_state=pose.joint_state * category.state_units,
         parts=se3.compose(se3.inverse(poses[0]), poses),
         labels=jnp.where(labels >= 0, labels, prediction.labels[0]),
-        constants=ObjectParameters(
+        parameters=ObjectParameters(
             axis=pose.joint_axis,
             pivot=pose.joint_pivot * unit,
             size=pose.size * unit,
             center=pose.box_center * unit,
-            seen=jnp.asarray(1.0),
+            num_frames=jnp.asarray(1.0),
             known=jnp.zeros(category.num_joints),
         ),
-        sure=prediction.confidence[0].min(),
-        turn=_NO_TURN,
+        confidence=prediction.confidence[0].min(),
+        rotation_log_odds=_NO_ROTATION,
     )
-    return of_type(fix, points.dtype)
+    return of_type(measurement, points.dtype)
 
 
-def averaged(old: ObjectParameters, new: ObjectParameters) -> ObjectParameters:
+def update_parameters(old: ObjectParameters, new: ObjectParameters) -> ObjectParameters:
     """Running means over the frames of a video."""
-    seen = jnp.minimum(old.seen, _MEMORY)
-    of_parts, of_joints = 1.0 / (seen + 1.0), 1.0 / (seen + old.known + 1.0)[:, None]
+    num_frames = jnp.minimum(old.num_frames, _MEMORY)
+    of_parts, of_joints = 1.0 / (num_frames + 1.0), 1.0 / (num_frames + old.known + 1.0)[:, None]
     return ObjectParameters(
         axis=linalg.unit(old.axis + of_joints * (new.axis - old.axis)),
         pivot=old.pivot + of_joints * (new.pivot - old.pivot),
         size=old.size + of_parts * (new.size - old.size),
         center=old.center + of_parts * (new.center - old.center),
-        seen=old.seen + 1.0,
+        num_frames=old.num_frames + 1.0,
         known=old.known,
     )
 
 
-def diagonal(constants: ObjectParameters):
+def diagonal(parameters: ObjectParameters):
     """[] length of the diagonal of the object's box at rest."""
-    half = jnp.abs(constants.size) / 2
-    low, high = (constants.center - half).min(0), (constants.center + half).max(0)
+    half = jnp.abs(parameters.size) / 2
+    low, high = (parameters.center - half).min(0), (parameters.center + half).max(0)
     return jnp.maximum(linalg.norm(high - low), 1e-3)
 
 
-def own_coordinates(fix: PoseMeasurement, points):
-    """Points [N, 3] of the camera's frame, each in the frame of its part."""
-    poses = se3.compose(fix.root, fix.parts)
-    return se3.act(se3.inverse(poses)[fix.labels], points[:, None])[:, 0]
+def part_coordinates(measurement: PoseMeasurement, points):
+    """Points [N, 3] of the camera frame, each in the frame of its part."""
+    poses = se3.compose(measurement.root, measurement.parts)
+    return se3.act(se3.inverse(poses)[measurement.labels], points[:, None])[:, 0]
 
 
-def box_residual(fix: PoseMeasurement, points):
+def box_residual(measurement: PoseMeasurement, points):
     """Mean distance [] of points [N, 3] from the boxes of their parts, over the object's diagonal.
 
-    The one thing in a pose that its own history cannot make look right: sizes are the category's.
+    A track that drifts cannot hide it: sizes are the category's.
     """
-    own = own_coordinates(fix, points)
-    sizes, centers = fix.constants.size[fix.labels], fix.constants.center[fix.labels]
+    own = part_coordinates(measurement, points)
+    sizes, centers = (
+        measurement.parameters.size[measurement.labels],
+        measurement.parameters.center[measurement.labels],
+    )
     outside = jnp.maximum(jnp.abs(own - centers) - sizes / 2, 0.0)
-    return linalg.norm(outside).mean() / diagonal(fix.constants)
+    return linalg.norm(outside).mean() / diagonal(measurement.parameters)
+
+
+def joints_from_poses(parts, votes: ObjectParameters, category: Category):
+    """Joint states, axes and pivots that fit given part poses, as far as these determine them.
+
+    A child's pose in its parent's frame is ``[R | (I - R) q]`` (Eq 8): the axis of R is the
+    joint's, its angle the state, and the pivot q follows but for its place along the axis. Near
+    rest R and I - R vanish and the votes of the network stay as they are; in between, both count
+    by their uncertainty.
+
+    Args:
+      parts: [K, 4, 4] part poses in the root's frame, network units.
+      votes: joints as the network sees them; its axes also decide about the signs.
+      category: joint types and tree.
+
+    Returns:
+      (states [J], parameters with new axes, pivots and ``known``).
+    """
+    states, axes, pivots, known = [], [], [], []
+    for joint, (kind, parent) in enumerate(
+        zip(category.joint_types, category.parents, strict=True)
+    ):
+        relative = se3.compose(se3.inverse(parts[parent]), parts[joint + 1])
+        rotation, translation = relative[:3, :3], relative[:3, 3]
+        turns = kind == "revolute"
+        motion, scale = (so3.log(rotation), _TURN) if turns else (translation, _SLIDE)
+        voted = votes.axis[joint]
+        forward = jnp.where(linalg.dot(motion, voted) < 0, -1.0, 1.0)
+        weight = linalg.dot(motion, motion) / scale**2
+        length = linalg.norm(motion)
+        axis = linalg.unit(voted + weight * forward * linalg.unit(motion))
+        states.append(forward * length)
+        axes.append(axis)
+        known.append(weight)
+        pivot = votes.pivot[joint]
+        if turns:
+            arm = jnp.eye(3, dtype=rotation.dtype) - rotation
+            normal = linalg.multiply(arm.T, arm) + _PIVOT**2 * jnp.eye(3, dtype=arm.dtype)
+            missing = translation - linalg.apply(arm, pivot)
+            pivot += jnp.linalg.solve(normal, linalg.apply(arm.T, missing))
+        pivots.append(pivot)
+    parameters = replace(
+        votes, axis=jnp.stack(axes), pivot=jnp.stack(pivots), known=10.0 * jnp.stack(known)
+    )
+    return jnp.stack(states), parameters

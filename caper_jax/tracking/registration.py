@@ -15,14 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
-from caper_jax.articulation.joints import joint_transforms
+from caper_jax.articulation.kinematics import joint_transforms
 from caper_jax.config import RegistrationConfig
 from caper_jax.lie import linalg, se3
 from caper_jax.models.encoders.neighbors import gather, smallest, squared_distances
@@ -41,10 +41,10 @@ class SurfaceMap:
       added: [] int32, how many were ever added; the next one takes the place ``added`` modulo M.
     """
 
-    mean: Any
-    information: Any
-    labels: Any
-    added: Any
+    mean: Float[Array, "M 3"]
+    information: Float[Array, "M 3 3"]
+    labels: Int[Array, "M"]
+    added: Int[Array, ""]
 
 
 @flax.struct.dataclass
@@ -57,8 +57,8 @@ class JointTree:
       types, parents: static, see ``forward_kinematics``.
     """
 
-    axis: Any
-    pivot: Any
+    axis: Float[Array, "J 3"]
+    pivot: Float[Array, "J 3"]
     types: tuple[str, ...] = flax.struct.field(pytree_node=False)
     parents: tuple[int, ...] = flax.struct.field(pytree_node=False)
 
@@ -74,8 +74,8 @@ class PartPoses:
     """
 
     tree: JointTree
-    state: Any
-    poses: Any
+    state: Float[Array, "J"]
+    poses: Float[Array, "K 4 4"]
 
     def at(self, state):
         """[K, 4, 4] poses at joint states [J]: the keyframe's, moved by the joints (Eq 8)."""

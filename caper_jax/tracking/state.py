@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import flax.struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
+from caper_jax.articulation.pose import Array as AnyArray
 from caper_jax.tracking.registration import SurfaceMap
 
 
@@ -21,9 +21,9 @@ class Observation:
       labels: [N] int32 part of each point where it is known, -1 where the tracker is to predict it.
     """
 
-    points: Any
-    present: Any
-    labels: Any
+    points: Float[AnyArray, "*frames N 3"]
+    present: Bool[AnyArray, "*frames"]
+    labels: Int[AnyArray, "*frames N"]
 
 
 @flax.struct.dataclass
@@ -33,16 +33,16 @@ class ObjectParameters:
     Attributes:
       axis, pivot: [J, 3] of the joints.
       size, center: [K, 3] of the parts' boxes.
-      seen: [] float, frames in these means.
+      num_frames: [] float, frames in these means.
       known: [J] float, how many frames' worth is known of each joint from a given first pose.
     """
 
-    axis: Any
-    pivot: Any
-    size: Any
-    center: Any
-    seen: Any
-    known: Any
+    axis: Float[Array, "J 3"]
+    pivot: Float[Array, "J 3"]
+    size: Float[Array, "K 3"]
+    center: Float[Array, "K 3"]
+    num_frames: Float[Array, ""]
+    known: Float[Array, "J"]
 
 
 @flax.struct.dataclass
@@ -58,12 +58,12 @@ class Keyframe:
       age: [] int32, frames since.
     """
 
-    root: Any
-    joint_state: Any
-    parts: Any
-    points: Any
-    labels: Any
-    age: Any
+    root: Float[Array, "4 4"]
+    joint_state: Float[Array, "J"]
+    parts: Float[Array, "K 4 4"]
+    points: Float[Array, "N 3"]
+    labels: Int[Array, "N"]
+    age: Int[Array, ""]
 
 
 @flax.struct.dataclass
@@ -76,36 +76,36 @@ class TrackerState:
       parts: [K, 4, 4] pose of each part in the root's frame.
       root_velocity: [6] twist from frame to frame, in the root's frame.
       joint_velocity: [J].
-      constants: what does not change in a video, as the mean over the frames so far.
+      parameters: what does not change in a video, as the mean over the frames so far.
       variance: [3] of root rotation, root translation and joint states, as far as they have
-        drifted from what the static estimator or the user gave.
+        drifted from what the estimator or the user gave.
       keyframe: what increments refer to.
-      surface: what was seen of the parts so far, for registration.
-      accepted: [] the box residual that the static estimator was asked about and could not
-        better, so that objects of unusual size are not doubted again and again.
+      surface: the parts' surfaces as far as the frames so far show them, for registration.
+      accepted_residual: [] the box residual that an estimate could not improve, so that objects of
+        unusual size do not count as inconsistent again and again.
       num_inconsistent: [] int32, frames in a row that disagreed with the track.
-      turn: [24] log odds, over the frames so far, that the track is off by a turn, as stage II sees
-        it.
-      vote: [24] likewise, by static estimates on trial.
-      trial: [] int32, in so many further frames the static estimator is asked.
-      lost: [] bool, the next frame with points starts afresh from the static estimator.
+      rotation_log_odds: [24] log odds, over the frames so far, that the track is off by each of
+        ``models.rotation_classes``, according to stage II.
+      rotation_votes: [24] likewise, according to the estimates of the first frames.
+      init_frames_left: [] int32, in how many further frames the estimator is queried.
+      lost: [] bool, the next frame with points starts from the estimator alone.
     """
 
-    root: Any
-    joint_state: Any
-    parts: Any
-    root_velocity: Any
-    joint_velocity: Any
-    constants: ObjectParameters
-    variance: Any
+    root: Float[Array, "4 4"]
+    joint_state: Float[Array, "J"]
+    parts: Float[Array, "K 4 4"]
+    root_velocity: Float[Array, "6"]
+    joint_velocity: Float[Array, "J"]
+    parameters: ObjectParameters
+    variance: Float[Array, "3"]
     keyframe: Keyframe
     surface: SurfaceMap
-    accepted: Any
-    num_inconsistent: Any
-    turn: Any
-    vote: Any
-    trial: Any
-    lost: Any
+    accepted_residual: Float[Array, ""]
+    num_inconsistent: Int[Array, ""]
+    rotation_log_odds: Float[Array, "24"]
+    rotation_votes: Float[Array, "24"]
+    init_frames_left: Int[Array, ""]
+    lost: Bool[Array, ""]
 
 
 def of_type(tree, dtype):

@@ -9,32 +9,34 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
 from caper_jax.articulation.category import Category
+from caper_jax.articulation.pose import Array as AnyArray
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.config import NetworkConfig, RegistrationConfig, TrackerConfig
 from caper_jax.lie import se3
 from caper_jax.models.pipeline import SMALLEST_SIZE
 from caper_jax.models.rotation_classes import NUM_CUBE_ROTATIONS
-from caper_jax.tracking.energy import chamfer_energy
-from caper_jax.tracking.joints import joints_from_poses
 from caper_jax.tracking.keyframes import (
-    added,
-    corrected,
-    grown_surface,
+    add_log_odds,
+    chamfer_energy,
+    grow_surface,
     is_keyframe,
+    keyframe_cloud,
     make_keyframe,
-    moved_cloud,
     poses_disagree,
-    rebased_surface,
+    rebase_surface,
     tree_where,
+    update_keyframe,
 )
 from caper_jax.tracking.measurement import (
     PoseMeasurement,
-    averaged,
     box_residual,
     diagonal,
+    joints_from_poses,
     measure,
+    update_parameters,
 )
 from caper_jax.tracking.registration import (
     JointTree,
@@ -47,43 +49,43 @@ from caper_jax.tracking.registration import (
 )
 from caper_jax.tracking.state import Keyframe, ObjectParameters, Observation, TrackerState, of_type
 
-_ACCEPTED = 1.3  # how much worse than an accepted box_residual poses_disagree again
-_GIVEN = 60.0  # nats against a turn of a pose that the user gave
-_ENERGY_STRIDE = 2  # every so-manieth point enters the energy
+_ACCEPTED = 1.3  # a box residual this many times the accepted one is inconsistent again
+_GIVEN = 60.0  # nats against another rotation class of a pose that the user gave
+_ENERGY_STRIDE = 2  # every second point enters the energy
 
 
 @flax.struct.dataclass
 class TrackResult:
-    """What the tracker says about one frame.
+    """Result of the tracker for one frame.
 
     Attributes:
       pose: ArticulatedPose [K, ...], meters, camera frame.
       labels: [N] int32 part of each point.
       energy: [] Eq 16, relative to the object's diagonal.
       keyframe: [] bool, whether this frame became the keyframe.
-      estimated: [] bool, whether the static estimator was asked.
-      lost: [] bool, the pose is not to be trusted: held from before, as the frame does not show the
-        object or holds impossible numbers, or this frame's, contradicted by what it does show.
+      estimator_queried: [] bool, whether the single-frame estimator ran.
+      lost: [] bool, the pose is not to be trusted: it is held from before, as the frame does not
+        show the object or holds impossible numbers; or it is inconsistent with the frame.
     """
 
     pose: ArticulatedPose
-    labels: Any
-    energy: Any
-    keyframe: Any
-    estimated: Any
-    lost: Any
+    labels: Int[AnyArray, "*frames N"]
+    energy: Float[AnyArray, "*frames"]
+    keyframe: Bool[AnyArray, "*frames"]
+    estimator_queried: Bool[AnyArray, "*frames"]
+    lost: Bool[AnyArray, "*frames"]
 
 
 def initial_state(category: Category, network: NetworkConfig, config: TrackerConfig):
-    """The state before the first frame: the static estimator gives that frame's pose."""
+    """The state before the first frame: the single-frame estimator gives that frame's pose."""
     parts, joints, points = category.num_parts, category.num_joints, network.num_points
     eye = jnp.eye(4)
-    constants = ObjectParameters(
+    parameters = ObjectParameters(
         axis=jnp.tile(jnp.array([1.0, 0.0, 0.0]), (joints, 1)),
         pivot=jnp.zeros((joints, 3)),
         size=jnp.asarray(category.mean_size) * category.unit,
         center=jnp.asarray(category.mean_center) * category.unit,
-        seen=jnp.asarray(0.0),
+        num_frames=jnp.asarray(0.0),
         known=jnp.zeros(joints),
     )
     keyframe = Keyframe(
@@ -100,15 +102,15 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
         parts=keyframe.parts,
         root_velocity=jnp.zeros(6),
         joint_velocity=jnp.zeros(joints),
-        constants=constants,
+        parameters=parameters,
         variance=jnp.zeros(3),
         keyframe=keyframe,
         surface=empty_surface(config.registration),
-        accepted=jnp.zeros(()),
+        accepted_residual=jnp.zeros(()),
         num_inconsistent=jnp.asarray(0, jnp.int32),
-        turn=jnp.zeros(NUM_CUBE_ROTATIONS),
-        vote=jnp.zeros(NUM_CUBE_ROTATIONS),
-        trial=jnp.asarray(0, jnp.int32),
+        rotation_log_odds=jnp.zeros(NUM_CUBE_ROTATIONS),
+        rotation_votes=jnp.zeros(NUM_CUBE_ROTATIONS),
+        init_frames_left=jnp.asarray(0, jnp.int32),
         lost=jnp.asarray(True),
     )
     return of_type(state, eye.dtype)
@@ -139,19 +141,19 @@ def given_state(
     root, parts = poses[0], se3.compose(se3.inverse(poses[0]), poses)
     points = frame.points * category.unit
     found = measure(variables, points, frame.labels, root, category, network)
-    states, constants = joints_from_poses(parts, found.constants, category)
-    fix = replace(found, root=root, parts=parts, joint_state=states, constants=constants)
+    states, parameters = joints_from_poses(parts, found.parameters, category)
+    measurement = replace(found, root=root, parts=parts, joint_state=states, parameters=parameters)
     begin = initial_state(category, network, config)
     after = replace(
         begin,
         root=root,
-        joint_state=fix.joint_state,
+        joint_state=measurement.joint_state,
         parts=parts,
-        constants=fix.constants,
-        keyframe=make_keyframe(fix, points),
-        surface=grown_surface(begin.surface, fix, points, config),
-        turn=begin.turn - _GIVEN,
-        vote=begin.vote - _GIVEN,
+        parameters=measurement.parameters,
+        keyframe=make_keyframe(measurement, points),
+        surface=grow_surface(begin.surface, measurement, points, config),
+        rotation_log_odds=begin.rotation_log_odds - _GIVEN,
+        rotation_votes=begin.rotation_votes - _GIVEN,
         lost=jnp.asarray(False),
     )
     return of_type(after, begin.root.dtype)
@@ -179,7 +181,7 @@ def track_step(
       category, network, config: static.
 
     Returns:
-      The next state, and what was found in this frame.
+      The next state, and the result for this frame.
     """
     step = partial(_track_step, category=category, network=network, config=config)
     # A scan keeps the compiler from merging both runs: no barrier is needed.
@@ -206,8 +208,8 @@ def _track_step(
     )
     reference = predicted[0] if config.use_prediction else key.root
     found = measure(variables, points, frame.labels, reference, category, network)
-    constants = averaged(state.constants, found.constants)
-    tree = JointTree(constants.axis, constants.pivot, category.joint_types, category.parents)
+    parameters = update_parameters(state.parameters, found.parameters)
+    tree = JointTree(parameters.axis, parameters.pivot, category.joint_types, category.parents)
 
     root, joints = found.root, found.joint_state
     parts = PartPoses(tree, key.joint_state, key.parts)
@@ -219,83 +221,99 @@ def _track_step(
         root, joints, information = register(*against, start, expected, config.registration)
         root = suppress_jitter(state.root, root, information, config.registration.hold)
     tracked = PoseMeasurement(
-        root, joints, parts.at(joints), found.labels, constants, found.sure, found.turn
+        root,
+        joints,
+        parts.at(joints),
+        found.labels,
+        parameters,
+        found.confidence,
+        found.rotation_log_odds,
     )
     # Frames show the same object from nearly the same side, so that each counts for little.
-    turn = added(state.turn, jnp.clip(found.turn, -1.0, 1.0), config)
-    due_turn = (turn.max() > config.flip_log_odds) & ~state.lost
-    turned = jnp.where(due_turn, turn.argmax(), 0).astype(jnp.int32)
+    log_odds = add_log_odds(
+        state.rotation_log_odds, jnp.clip(found.rotation_log_odds, -1.0, 1.0), config
+    )
+    is_rotated = (log_odds.max() > config.flip_log_odds) & ~state.lost
+    rotation_class = jnp.where(is_rotated, log_odds.argmax(), 0).astype(jnp.int32)
 
     unmatched = match_cost(*against, (root, joints), config.registration)
-    outside = box_residual(tracked, points)
-    contradicted = (
+    residual = box_residual(tracked, points)
+    is_inconsistent = (
         (unmatched > config.max_match_cost)
-        | (outside > jnp.maximum(config.max_box_residual, _ACCEPTED * state.accepted))
+        | (residual > jnp.maximum(config.max_box_residual, _ACCEPTED * state.accepted_residual))
         | poses_disagree(root, found.root, config)
     )
-    num_inconsistent = jnp.where(contradicted, state.num_inconsistent + 1, 0)
+    num_inconsistent = jnp.where(is_inconsistent, state.num_inconsistent + 1, 0)
     energy = chamfer_energy(
         se3.act(se3.inverse(root), points)[::_ENERGY_STRIDE],
         found.labels[::_ENERGY_STRIDE],
-        moved_cloud(key, tracked)[::_ENERGY_STRIDE],
+        keyframe_cloud(key, tracked)[::_ENERGY_STRIDE],
         key.labels[::_ENERGY_STRIDE],
         category.num_parts,
-        diagonal(constants),
+        diagonal(parameters),
     )
-    due = is_keyframe(energy, unmatched, key.age, config) | (state.trial > 0)
-    correction = corrected(
+    due = is_keyframe(energy, unmatched, key.age, config) | (state.init_frames_left > 0)
+    correction = update_keyframe(
         variables,
         points,
         frame.labels,
         tracked,
-        outside,
+        residual,
         state,
         due,
         num_inconsistent,
-        turned,
+        rotation_class,
         category,
         network,
         config,
     )
-    fix, sure, replaced = correction.fix, correction.sure, correction.replaced
+    measurement = correction.measurement
+    accepted, replaced = correction.accepted, correction.replaced
     due |= replaced
-    # One that is unsure is asked again in the next frame.
-    settled = (num_inconsistent >= config.patience) & sure
-    left = jnp.maximum(state.trial - sure, 0)
+    # After an estimate that does not count, the estimator is queried again in the next frame.
+    settled = (num_inconsistent >= config.patience) & accepted
+    left = jnp.maximum(state.init_frames_left - accepted, 0)
     # Without keyframes a frame knows of the last one only.
-    anew = replaced | (config.policy == "none")
+    restart = replaced | (config.policy == "none")
     surface = jax.lax.cond(
         due,
-        lambda: grown_surface(
-            rebased_surface(state.surface, tracked, fix, anew, config), fix, points, config
+        lambda: grow_surface(
+            rebase_surface(state.surface, tracked, measurement, restart, config),
+            measurement,
+            points,
+            config,
         ),
         lambda: state.surface,
     )
 
-    missed = se3.log(se3.compose(se3.inverse(predicted[0]), fix.root))
+    missed = se3.log(se3.compose(se3.inverse(predicted[0]), measurement.root))
     velocity = config.damping * state.root_velocity + config.velocity_gain * missed
     joint_velocity = config.damping * state.joint_velocity
-    joint_velocity += config.velocity_gain * (fix.joint_state - predicted[1])
+    joint_velocity += config.velocity_gain * (measurement.joint_state - predicted[1])
     after = TrackerState(
-        root=fix.root,
-        joint_state=fix.joint_state,
-        parts=fix.parts,
+        root=measurement.root,
+        joint_state=measurement.joint_state,
+        parts=measurement.parts,
         root_velocity=jnp.where(replaced, 0.0, velocity),
         joint_velocity=jnp.where(replaced, 0.0, joint_velocity),
-        constants=fix.constants,
+        parameters=measurement.parameters,
         variance=correction.variance,
-        keyframe=tree_where(due, make_keyframe(fix, points), replace(key, age=key.age + 1)),
+        keyframe=tree_where(due, make_keyframe(measurement, points), replace(key, age=key.age + 1)),
         surface=surface,
-        accepted=jnp.where(
-            replaced, 0.0, jnp.where(settled, jnp.maximum(outside, state.accepted), state.accepted)
+        accepted_residual=jnp.where(
+            replaced,
+            0.0,
+            jnp.where(
+                settled, jnp.maximum(residual, state.accepted_residual), state.accepted_residual
+            ),
         ),
-        # A pose from the static estimator alone is on trial: one contradiction undoes it.
+        # A pose from the estimator alone is provisional: one inconsistent frame undoes it.
         num_inconsistent=jnp.where(
             replaced, config.patience - 1, jnp.where(settled, 0, num_inconsistent)
         ),
-        turn=jnp.where(replaced, 0.0, turn),
-        vote=jnp.where(replaced, 0.0, correction.vote),
-        trial=jnp.where(replaced, config.init_frames, left).astype(jnp.int32),
+        rotation_log_odds=jnp.where(replaced, 0.0, log_odds),
+        rotation_votes=jnp.where(replaced, 0.0, correction.rotation_votes),
+        init_frames_left=jnp.where(replaced, config.init_frames, left).astype(jnp.int32),
         lost=jnp.asarray(False),
     )
     held = replace(
@@ -308,11 +326,11 @@ def _track_step(
     after = tree_where(usable, after, held)
     return after, TrackResult(
         pose=_articulated_pose(after, category),
-        labels=fix.labels,
+        labels=measurement.labels,
         energy=energy,
         keyframe=due & usable,
-        estimated=correction.asked & usable,
-        lost=~usable | (contradicted & ~replaced),
+        estimator_queried=correction.estimator_queried & usable,
+        lost=~usable | (is_inconsistent & ~replaced),
     )
 
 
@@ -348,10 +366,10 @@ def _articulated_pose(state: TrackerState, category: Category) -> ArticulatedPos
         rotation=poses[:, :3, :3],
         translation=poses[:, :3, 3] / unit,
         size=jnp.maximum(
-            state.constants.size / unit, SMALLEST_SIZE * jnp.asarray(category.mean_size)
+            state.parameters.size / unit, SMALLEST_SIZE * jnp.asarray(category.mean_size)
         ),
-        box_center=state.constants.center / unit,
-        joint_axis=state.constants.axis,
-        joint_pivot=state.constants.pivot / unit,
+        box_center=state.parameters.center / unit,
+        joint_axis=state.parameters.axis,
+        joint_pivot=state.parameters.pivot / unit,
         joint_state=state.joint_state / category.state_units,
     )

@@ -24,7 +24,12 @@ from caper_jax.estimator import Estimator, load
 from caper_jax.geometry.frames import rotate, view_rotation
 from caper_jax.lie import se3
 from caper_jax.models.files import write_model
-from caper_jax.models.pipeline import articulated_pose, read, refinements, refiner_inputs
+from caper_jax.models.pipeline import (
+    articulated_pose,
+    refinements,
+    refiner_inputs,
+    run_stages,
+)
 from caper_jax.models.refiner import BoxRefiner, RefinerOutput
 from caper_jax.progress import progress
 from caper_jax.synthetic.frames import Batch
@@ -146,7 +151,7 @@ def _measure(variables, batch: Batch, category: Category, network: NetworkConfig
     estimate: before and after each iteration of the network's refiner."""
     view = view_rotation(batch.points, category.viewpoint.camera_roll)
     cloud = rotate(view, batch.points) * category.unit
-    outputs = read(variables, cloud, category, network)
+    outputs = run_stages(variables, cloud, category, network)
     rows = []
     for estimate in refinements(variables, outputs, cloud, category, network):
         pose = articulated_pose(estimate, view, category)

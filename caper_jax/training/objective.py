@@ -31,8 +31,14 @@ from caper_jax.geometry.frames import (
 from caper_jax.geometry.raster_order import raster_order, to_raster_order
 from caper_jax.geometry.two_axis_rotation import rotation_from_directions
 from caper_jax.lie import se3, so3
-from caper_jax.models.increment import increment_numbers, increment_transform
-from caper_jax.models.networks import PartsNetwork, PartsOutput, RootNetwork, RootOutput
+from caper_jax.models.parts import (
+    PartsNetwork,
+    PartsOutput,
+    increment_numbers,
+    increment_transform,
+    vote,
+)
+from caper_jax.models.root import RootNetwork, RootOutput
 from caper_jax.models.rotation_classes import (
     CUBE_ROTATIONS,
     HALF_TURNS,
@@ -40,7 +46,6 @@ from caper_jax.models.rotation_classes import (
     nearest_cube_rotation,
     rotate_pose,
 )
-from caper_jax.models.voting import vote
 from caper_jax.training import losses
 
 PyTree = Any
@@ -147,10 +152,12 @@ def stage2_loss(outputs: PartsOutput, targets: PartsTargets, config: LossConfig)
         + losses.scale_loss(outputs.center, targets.center),
         "segmentation": losses.segmentation_loss(outputs.segmentation, targets.labels),
     }
-    if outputs.turn is not None:
+    if outputs.rotation_class is not None:
         unrotated = (targets.rotation_class == 0).astype(axis.dtype)
         terms = {name: value * unrotated for name, value in terms.items()}
-        terms["rotation_class"] = losses.rotation_class_loss(outputs.turn, targets.rotation_class)
+        terms["rotation_class"] = losses.rotation_class_loss(
+            outputs.rotation_class, targets.rotation_class
+        )
     terms["twist"] = losses.twist_loss(outputs.increment, targets.increment)
     return {**terms, "total": losses.weighted_total(config.weights, terms)}
 
@@ -446,8 +453,8 @@ class Objective:
         known = (targets.labels >= 0) * unrotated[:, None]
         right = outputs.segmentation.argmax(-1) == targets.labels
         metrics["segmentation_accuracy"] = (right * known).sum() / jnp.maximum(known.sum(), 1.0)
-        if outputs.turn is not None:
-            right = outputs.turn.argmax(-1) == targets.rotation_class
+        if outputs.rotation_class is not None:
+            right = outputs.rotation_class.argmax(-1) == targets.rotation_class
             metrics["rotation_class_accuracy"] = right.mean()
         kind = self.network.increment
         said, true = (

@@ -84,6 +84,6 @@ class KnownTracker:
             labels=None,
             energy=0.0,
             keyframe=first,
-            estimated=False,
+            estimator_queried=False,
             lost=first,
         )

@@ -13,7 +13,7 @@ import yourdfpy
 from _helpers.quick import quick_jit
 from scipy.spatial.transform import Rotation
 
-from caper_jax.articulation import joints
+from caper_jax.articulation import kinematics
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.errors import CaperError
 
@@ -138,9 +138,9 @@ def test_gradients_are_finite_at_every_state(joint_type):
     axis = np.float32([[0, 0, 1], [0, 0, 0], [1e-20, 0, 0]])[:, None]
 
     def value(axis, pivot, state):
-        return joints.joint_transform(joint_type, axis, pivot, state).sum()
+        return kinematics.joint_transform(joint_type, axis, pivot, state).sum()
 
-    transform = quick_jit(joints.joint_transform, static_argnums=0)(
+    transform = quick_jit(kinematics.joint_transform, static_argnums=0)(
         joint_type, axis, np.float32([1, 2, 3]), state
     )
     assert jnp.isfinite(transform).all()
@@ -151,22 +151,22 @@ def test_gradients_are_finite_at_every_state(joint_type):
 
 def test_directions_of_motion():
     # A positive state turns the child by plus the state about the axis, and slides it along.
-    quarter = joints.revolute_transform([0.0, 0.0, 2.0], [1.0, 0.0, 5.0], np.pi / 2)
+    quarter = kinematics.revolute_transform([0.0, 0.0, 2.0], [1.0, 0.0, 5.0], np.pi / 2)
     np.testing.assert_allclose(quarter @ np.array([2.0, 0, 0, 1]), [1, 1, 0, 1], atol=1e-6)
     np.testing.assert_allclose(quarter @ np.array([1.0, 0, 7, 1]), [1, 0, 7, 1], atol=1e-6)
-    slid = joints.prismatic_transform([0.0, 3.0, 0.0], 0.25)
+    slid = kinematics.prismatic_transform([0.0, 3.0, 0.0], 0.25)
     np.testing.assert_array_equal(slid[:3], np.c_[np.eye(3), [0, 0.25, 0]])
 
 
 def test_a_sliding_joint_needs_no_pivot():
     nowhere = np.full(3, np.nan)
-    slid = joints.joint_transform("prismatic", [0.0, 3.0, 0.0], nowhere, 0.25)
-    np.testing.assert_array_equal(slid, joints.prismatic_transform([0.0, 3.0, 0.0], 0.25))
+    slid = kinematics.joint_transform("prismatic", [0.0, 3.0, 0.0], nowhere, 0.25)
+    np.testing.assert_array_equal(slid, kinematics.prismatic_transform([0.0, 3.0, 0.0], 0.25))
 
 
 def test_small_turns_about_far_pivots_keep_their_digits():
     # q - R q would leave the rounding of q: 1e-6 m here, a thousandth of the motion.
-    revolute = quick_jit(joints.revolute_transform)
+    revolute = quick_jit(kinematics.revolute_transform)
     axis, pivot, angle = np.array([0.0, 0.6, 0.8]), np.array([10.0, -7.0, 3.0]), 1e-4
     with jax.enable_x64(True):
         exact = np.asarray(revolute(axis, pivot, angle))

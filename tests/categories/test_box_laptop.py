@@ -10,7 +10,7 @@ from _helpers.solid_points import inside, loose
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.instances import build_bank, draw_instances
 
 # Length, height and depth of the base of the eight measured ReArt-48 boxes span these ranges, mm.

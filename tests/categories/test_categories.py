@@ -10,7 +10,7 @@ import pytest
 from caper_jax import categories
 from caper_jax.articulation.category import Category, Joint, Symmetry
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.instances import draw_instances
 
 NAMES = categories.names()
@@ -179,7 +179,7 @@ def test_declared_equivalences_are_half_turns_that_exchange_parts():
             order = np.array(symmetry.permutation)
             assert sorted(order) == list(range(category.num_parts))
             assert (order[order] == np.arange(len(order))).all()
-            turn = np.array(symmetry.turn)
+            turn = np.array(symmetry.rotation)
             np.testing.assert_allclose(turn @ turn, np.eye(3), atol=1e-12)
             np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
             assert np.linalg.det(turn) > 0

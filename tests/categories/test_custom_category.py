@@ -20,9 +20,10 @@ from caper_jax.data import hdf5
 from caper_jax.data.readers import open_dataset
 from caper_jax.errors import CaperError
 from caper_jax.estimator import load
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.models.files import write_model
 from caper_jax.synthetic.instances import build_bank, draw_instances
+from caper_jax.tracker import load_tracker
 from caper_jax.training import train as run
 from caper_jax.training.objective import Objective
 
@@ -96,8 +97,14 @@ def test_datasets_open_under_any_spelling(tmp_path):
     assert open_dataset("caper", path, spelled).category is categories.get(spelled)
 
 
-def test_from_python_the_object_is_enough():
+def test_from_python_the_object_is_enough(tmp_path):
     category = microwave.MICROWAVE
+    config = tiny.network("fast", pool_first=True)
+    card = {"category": category.name, "run": {"network": to_dict(config)}}
+    write_model(tmp_path, tiny.random_variables(category, config), card)
+    assert load(category, tmp_path).category is category
+    assert load_tracker(category, tmp_path).estimator.category is category
+    assert "microwave" not in categories.names()
     assert categories.register(category) is category
     assert categories.get("microwave") is category and "microwave" in categories.names()
 

@@ -7,7 +7,7 @@ import pytest
 from _helpers.solid_points import inside, loose
 
 from caper_jax import categories
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.instances import draw_instances
 
 # Length, height and width of the body, and length and width of the blade with its carrier, of the

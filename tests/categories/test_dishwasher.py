@@ -8,7 +8,7 @@ from _helpers.solid_points import deepest_overlap, inside, loose
 from scipy.spatial.transform import Rotation
 
 from caper_jax.categories.dishwasher import DISHWASHER
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.instances import draw_instances
 
 CLOSE = 40  # instances of the tests that look at points

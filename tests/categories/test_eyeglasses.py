@@ -8,7 +8,7 @@ from _helpers.solid_points import deepest_overlap, inside, loose
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.instances import draw_instances
 
 SIDES = (-1.0, 1.0)  # of the temples, parts 1 and 2

@@ -7,9 +7,8 @@ import pytest
 from _helpers.solid_points import inside, loose
 from scipy.spatial.transform import Rotation
 
-from caper_jax.categories.forms import about, along, beam, chain, mirrored, turned
-from caper_jax.geometry.solid_bounds import bounds
-from caper_jax.geometry.solids import box, cone, cylinder, ellipsoid, frustum
+from caper_jax.categories.forms import about, along, beam, chain, mirrored, rotated
+from caper_jax.geometry.solids import bounds, box, cone, cylinder, ellipsoid, frustum
 
 RNG = np.random.default_rng(0)
 TILT = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()
@@ -47,7 +46,7 @@ def test_turned_solids_hold_the_turned_points(solid):
     hit = inside(solid, POINTS)
     assert 50 < hit.sum() < 3900
     moved = (POINTS - pivot) @ turn.T + pivot
-    np.testing.assert_array_equal(inside(turned(solid, turn, pivot), moved), hit)
+    np.testing.assert_array_equal(inside(rotated(solid, turn, pivot), moved), hit)
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "z"])

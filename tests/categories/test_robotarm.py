@@ -8,9 +8,8 @@ from _helpers.solid_points import deepest_overlap, loose
 from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.kinematics import forward_kinematics
-from caper_jax.categories import robotarm_chains as chains
-from caper_jax.categories.robotarm import _FAMILIES, ROBOTARM
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.categories.robotarm import _FAMILIES, ROBOTARM, chains
+from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.instances import draw_instances
 
 HALF = np.pi / 2

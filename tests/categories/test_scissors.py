@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from caper_jax import categories
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.articulation.symmetry import apply_symmetry
-from caper_jax.geometry.solid_bounds import bounds
-from caper_jax.geometry.solids import Solid
+from caper_jax.geometry.solids import Solid, bounds
 from caper_jax.synthetic.instances import build_bank, draw_instances
 
 REST = 20.0  # degrees between the blades

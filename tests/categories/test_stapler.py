@@ -8,7 +8,7 @@ from _helpers.solid_points import inside, loose
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.instances import draw_instances
 
 # Base length and width, height of the base with the hinge's cheeks, and height of the hinge over

@@ -22,7 +22,7 @@ def prediction(points, pose):
         labels=np.arange(points.shape[1], dtype=np.int32)[None] % 2,
         confidence=np.array([[0.75, 0.5]], np.float32),
         degenerate=np.array([False]),
-        seen=np.array([[points.shape[1] - 3, 3]], np.int32),
+        points_per_part=np.array([[points.shape[1] - 3, 3]], np.int32),
         evidence=np.zeros((1, 2, 6), np.float32),
         rotation_std=np.radians(np.array([[1.25, 2.5]], np.float32)),
         translation_std=np.array([[0.004, 0.006]], np.float32),

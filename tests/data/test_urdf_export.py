@@ -19,8 +19,7 @@ from caper_jax import categories
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.data.urdf.export import part_mesh, write_urdf
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solid_bounds import bounds
-from caper_jax.geometry.solids import box, cone, cylinder, ellipsoid, frustum
+from caper_jax.geometry.solids import bounds, box, cone, cylinder, ellipsoid, frustum
 from caper_jax.synthetic.instances import draw_instances
 
 NAMES = ("laptop", "drawer", "robotarm")

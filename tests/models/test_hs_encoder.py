@@ -14,7 +14,8 @@ from _helpers.tiny import HS, random_like
 from caper_jax import categories
 from caper_jax.config import HSEncoderConfig, preset
 from caper_jax.models.encoders.hs import HSEncoder, neighborhoods
-from caper_jax.models.networks import PartsNetwork, RootNetwork
+from caper_jax.models.parts import PartsNetwork
+from caper_jax.models.root import RootNetwork
 
 
 def neighbors(points, k):

@@ -19,8 +19,8 @@ from caper_jax.geometry.frames import canonicalize, rotate, view_rotation
 from caper_jax.models.encoders.fast import FastEncoder, local_moments
 from caper_jax.models.encoders.features import BlockDense, Features, Level
 from caper_jax.models.heads import PointHead, PooledHead, unit_vectors
-from caper_jax.models.networks import PartsNetwork, RootNetwork
-from caper_jax.models.voting import vote
+from caper_jax.models.parts import PartsNetwork, vote
+from caper_jax.models.root import RootNetwork
 
 
 def levels():

@@ -18,8 +18,8 @@ from caper_jax.config import RotationClassifierConfig
 from caper_jax.estimator import estimate
 from caper_jax.geometry.frames import part_points
 from caper_jax.models import rotation_classes
-from caper_jax.models.networks import PartsNetwork, RootNetwork, quaternion_axes
-from caper_jax.models.voting import vote
+from caper_jax.models.parts import PartsNetwork, vote
+from caper_jax.models.root import RootNetwork, quaternion_axes
 
 
 def test_turns_are_the_rotations_of_the_cube():

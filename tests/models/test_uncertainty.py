@@ -147,7 +147,10 @@ class TestModel:
         monkeypatch.setattr(jax, "jit", quick_jit)
         found = load("box", folder)(np.random.default_rng(0).normal(size=(64, 3)) + [0, 0, 2.0])
         assert found.rotation_std is found.state_std is None
-        assert found.seen.sum() == 64 and found.evidence.shape == (2, uncertainty.EVIDENCE)
+        assert found.points_per_part.sum() == 64 and found.evidence.shape == (
+            2,
+            uncertainty.EVIDENCE,
+        )
 
     def test_calibrate_makes_the_stated_region_hold_the_truth(
         self, folder, tmp_path, monkeypatch, capsys

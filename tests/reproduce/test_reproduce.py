@@ -156,7 +156,7 @@ def test_the_declared_symmetry_has_rows_of_its_own(tmp_path):
         truths = [frame.truth for frame in source.frames(name)]
         truth = jax.tree.map(lambda *rows: np.stack(rows), *truths)
         (symmetry,) = LAPTOP.symmetries
-        truth.size[:, 1] = truth.size[:, 0] @ np.abs(np.array(symmetry.turn))
+        truth.size[:, 1] = truth.size[:, 0] @ np.abs(np.array(symmetry.rotation))
         tracks.append(track(name, truth, apply_symmetry(truth, symmetry, LAPTOP)))
     found = runs.summarize(tracks, source, runs.Condition())
     assert found["frames"] == 6 and found["mean_diagonal_m"] > 0

@@ -14,7 +14,7 @@ from caper_jax.cli import generate, generate_layout
 from caper_jax.data.readers import open_dataset
 from caper_jax.data.types import validate
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.artimage_writer import LayoutWriter
 from caper_jax.synthetic.instances import draw_instances
 from caper_jax.synthetic.render import Image

@@ -15,7 +15,7 @@ from caper_jax import categories
 from caper_jax.config import GeneratorConfig
 from caper_jax.errors import CaperError
 from caper_jax.geometry.raster_order import grid_raster_order
-from caper_jax.geometry.solid_bounds import bounds
+from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic import sensor as sensors
 from caper_jax.synthetic.frames import Generator, draw_state_and_poses, systematic
 from caper_jax.synthetic.instances import build_bank, draw_instances

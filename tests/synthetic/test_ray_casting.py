@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.category import ObjectModel
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solid_bounds import bounds
-from caper_jax.geometry.solids import Solid, box, cone, cylinder, ellipsoid, frustum
+from caper_jax.geometry.solids import Solid, bounds, box, cone, cylinder, ellipsoid, frustum
 from caper_jax.synthetic.instances import build_bank
 from caper_jax.synthetic.ray_casting import FAR, cast, part_depths, projected_bounds
 

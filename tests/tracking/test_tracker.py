@@ -123,7 +123,7 @@ class TestShipped:
         nothing = np.full((30, 3), np.nan)
         for frame, points in ((6, np.zeros((0, 3))), (7, nothing), (8, np.ones((15, 3)))):
             held, _ = player.show(0, frame, points)
-            assert held.lost and not held.keyframe and not held.estimated
+            assert held.lost and not held.keyframe and not held.estimator_queried
             jax.tree.map(np.testing.assert_array_equal, held.pose, before.pose)
         again, errors = player.show(0, 9)
         assert not again.lost and errors.max() < 5
@@ -159,8 +159,8 @@ class TestShipped:
             player.begin(video, HALF_TURN)
             errors, _ = player.play(video, range(1, 3))
             assert errors.min() > 150
-            nothing = np.zeros_like(player.tracker.state.turn)
-            player.tracker.state = replace(player.tracker.state, turn=nothing)
+            nothing = np.zeros_like(player.tracker.state.rotation_log_odds)
+            player.tracker.state = replace(player.tracker.state, rotation_log_odds=nothing)
             errors, _ = player.play(video, range(3, 12))
             right.append(errors[-1].max() < 15)
         assert most(right)
@@ -179,13 +179,13 @@ class TestShipped:
             player.tracker.state = replace(silent, trial=np.int32(5))
             errors, _ = player.play(video, range(1, 5))
             right.append(errors[-1].max() < 15)
-            assert player.tracker.state.trial > 0
+            assert player.tracker.state.init_frames_left > 0
         assert most(right)
 
     def test_a_start_from_the_estimator_is_on_trial(self, player):
         player.tracker.reset()
-        asked = [bool(player.show(0, frame)[0].estimated) for frame in range(7)]
-        assert asked[:6] == [True] * 6 and player.tracker.state.trial == 0
+        asked = [bool(player.show(0, frame)[0].estimator_queried) for frame in range(7)]
+        assert asked[:6] == [True] * 6 and player.tracker.state.init_frames_left == 0
 
     def test_a_jump_to_another_object_is_noticed(self, player):
         right = []
@@ -307,7 +307,7 @@ def test_scans_loops_vmaps_and_slopes():
 
         scans = [differentiate(here[0], video[moved], video, nothing)[1] for video in clouds]
         scans = jax.tree.map(lambda *leaves: np.stack(leaves), *scans)
-        assert scans.keyframe.sum() > 4 and scans.estimated.sum() > 4
+        assert scans.keyframe.sum() > 4 and scans.estimator_queried.sum() > 4
         np.testing.assert_array_equal(scans.lost, [~present] * 2)
         step = quick_jit(jax.vmap(partial(tracker.function, variables)))
         states = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), begin)

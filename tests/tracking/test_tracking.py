@@ -17,12 +17,17 @@ from scipy.spatial.transform import Rotation
 from caper_jax import categories
 from caper_jax.config import TrackerConfig
 from caper_jax.errors import CaperError
-from caper_jax.models.increment import increment_numbers, increment_transform
+from caper_jax.models.parts import increment_numbers, increment_transform
 from caper_jax.models.rotation_classes import CUBE_ROTATIONS, NUM_CUBE_ROTATIONS
 from caper_jax.tracking import keyframes
-from caper_jax.tracking.energy import chamfer_energy
-from caper_jax.tracking.joints import joints_from_poses
-from caper_jax.tracking.measurement import PoseMeasurement, averaged, box_residual, diagonal
+from caper_jax.tracking.keyframes import chamfer_energy
+from caper_jax.tracking.measurement import (
+    PoseMeasurement,
+    box_residual,
+    diagonal,
+    joints_from_poses,
+    update_parameters,
+)
 from caper_jax.tracking.state import ObjectParameters
 
 LAPTOP = categories.get("laptop")
@@ -111,7 +116,7 @@ class TestJointsFromPoses:
             pivot=np.float32(pivot),
             size=np.ones((3, 3), np.float32),
             center=np.zeros((3, 3), np.float32),
-            seen=np.float32(1),
+            num_frames=np.float32(1),
             known=np.zeros(2, np.float32),
         )
 
@@ -126,20 +131,20 @@ class TestJointsFromPoses:
         return np.linalg.norm(np.cross(pivot - self.PIVOT[0], self.AXIS[0]))
 
     def test_a_large_motion_says_it_all(self):
-        states, constants = self.fit(self.parts(1.2, 0.9), self.votes(*self.wrong()))
+        states, parameters = self.fit(self.parts(1.2, 0.9), self.votes(*self.wrong()))
         np.testing.assert_allclose(states, [1.2, 0.9], atol=1e-5)
-        assert angle(constants.axis[0], self.AXIS[0]) < 0.2
-        assert angle(constants.axis[1], self.AXIS[1]) < 0.3
-        assert self.off_the_line(constants.pivot[0]) < 0.005
-        assert (np.asarray(constants.known) > 100).all()
+        assert angle(parameters.axis[0], self.AXIS[0]) < 0.2
+        assert angle(parameters.axis[1], self.AXIS[1]) < 0.3
+        assert self.off_the_line(parameters.pivot[0]) < 0.005
+        assert (np.asarray(parameters.known) > 100).all()
 
     def test_at_rest_the_votes_stay(self):
         votes = self.votes(*self.wrong())
-        states, constants = self.fit(self.parts(0.0, 0.0), votes)
+        states, parameters = self.fit(self.parts(0.0, 0.0), votes)
         np.testing.assert_allclose(states, 0.0, atol=1e-6)
-        np.testing.assert_allclose(constants.axis, votes.axis, atol=1e-6)
-        np.testing.assert_allclose(constants.pivot, votes.pivot, atol=1e-6)
-        np.testing.assert_allclose(constants.known, 0.0, atol=1e-6)
+        np.testing.assert_allclose(parameters.axis, votes.axis, atol=1e-6)
+        np.testing.assert_allclose(parameters.pivot, votes.pivot, atol=1e-6)
+        np.testing.assert_allclose(parameters.known, 0.0, atol=1e-6)
 
     def test_in_between_both_count(self):
         errors, lines = [], []
@@ -151,17 +156,17 @@ class TestJointsFromPoses:
 
     def test_signs_follow_the_votes(self):
         axis, pivot = self.wrong()
-        states, constants = self.fit(self.parts(-0.7, -0.4), self.votes(axis, pivot))
+        states, parameters = self.fit(self.parts(-0.7, -0.4), self.votes(axis, pivot))
         np.testing.assert_allclose(states, [-0.7, -0.4], atol=1e-5)
-        assert (np.sum(constants.axis * self.AXIS, 1) > 0.99).all()
-        states, constants = self.fit(self.parts(-0.7, -0.4), self.votes(-axis, pivot))
+        assert (np.sum(parameters.axis * self.AXIS, 1) > 0.99).all()
+        states, parameters = self.fit(self.parts(-0.7, -0.4), self.votes(-axis, pivot))
         np.testing.assert_allclose(states, [0.7, 0.4], atol=1e-5)
-        assert (np.sum(constants.axis * self.AXIS, 1) < -0.99).all()
+        assert (np.sum(parameters.axis * self.AXIS, 1) < -0.99).all()
 
     def test_slopes_are_finite_at_rest(self):
         def total(parts, votes):
-            states, constants = joints_from_poses(parts, votes, DOOR)
-            return states.sum() + constants.axis.sum() + constants.pivot.sum()
+            states, parameters = joints_from_poses(parts, votes, DOOR)
+            return states.sum() + parameters.axis.sum() + parameters.pivot.sum()
 
         slopes = quick_jit(jax.grad(total, argnums=(0, 1)))
         for turn, slide in ((0.0, 0.0), (0.5, 0.2)):
@@ -246,12 +251,12 @@ class TestPolicies:
 def laptop_fix(root, state=0.0) -> PoseMeasurement:
     """A laptop whose boxes are 2 x 2 x 2 about the origin and 2 x 1 x 1 about y = 3."""
     lid = rigid([state, 0, 0])
-    constants = ObjectParameters(
+    parameters = ObjectParameters(
         axis=np.float32([[1, 0, 0]]),
         pivot=np.zeros((1, 3), np.float32),
         size=np.float32([[2, 2, 2], [2, 1, 1]]),
         center=np.float32([[0, 0, 0], [0, 3, 0]]),
-        seen=np.float32(1),
+        num_frames=np.float32(1),
         known=np.zeros(1, np.float32),
     )
     return PoseMeasurement(
@@ -259,9 +264,9 @@ def laptop_fix(root, state=0.0) -> PoseMeasurement:
         joint_state=np.float32([state]),
         parts=np.float32(np.stack([np.eye(4), lid])),
         labels=POINT_LABELS,
-        constants=constants,
-        sure=np.float32(1),
-        turn=np.zeros(NUM_CUBE_ROTATIONS, np.float32),
+        parameters=parameters,
+        confidence=np.float32(1),
+        rotation_log_odds=np.zeros(NUM_CUBE_ROTATIONS, np.float32),
     )
 
 
@@ -277,7 +282,7 @@ def in_camera(points, fix: PoseMeasurement):
     return np.float32(np.einsum("nij,nj->ni", poses[:, :3, :3], points) + poses[:, :3, 3])
 
 
-class TestMisfit:
+class TestBoxResidual:
     measure = staticmethod(quick_jit(box_residual))
 
     def test_points_in_their_boxes_fit(self):
@@ -288,7 +293,7 @@ class TestMisfit:
         """0, 0.3, (0.3, 0, 0.4) and 0.2 units; the boxes span 2 x 4.5 x 2."""
         fix = laptop_fix(ROOT, 0.5)
         span = np.sqrt(4 + 4.5**2 + 4)
-        assert diagonal(fix.constants) == pytest.approx(span)
+        assert diagonal(fix.parameters) == pytest.approx(span)
         found = self.measure(fix, in_camera(BESIDE, fix))
         assert found == pytest.approx((0.3 + 0.5 + 0.2) / 4 / span, rel=1e-4)
 
@@ -300,7 +305,7 @@ def turned_answer(variables, points, labels, reference, *_):
 
 @pytest.fixture(scope="module")
 def programs():
-    """Settings -> compiled ``corrected``; the estimator answers with its ``variables``."""
+    """Settings -> compiled ``update_keyframe``; the estimator answers with its ``variables``."""
     compiled = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(keyframes, "estimate_measurement", lambda variables, *_: variables)
@@ -308,7 +313,7 @@ def programs():
         yield compiled
 
 
-class TestCorrected:
+class TestUpdateKeyframe:
     """What becomes of a track and an estimate of known poses."""
 
     # Of rotation, translation and joint states, by default: what one change of keyframe adds to
@@ -334,22 +339,27 @@ class TestCorrected:
             key = tuple(flags.items())
             if key not in programs:
 
-                def corrected(static, points, tracked, state, due, num_inconsistent, turned):
+                def update(static, points, tracked, state, due, num_inconsistent, turned):
                     state, settings = SimpleNamespace(**state), TrackerConfig(**flags)
                     rest = due, num_inconsistent, turned, LAPTOP, None, settings
-                    return keyframes.corrected(
+                    return keyframes.update_keyframe(
                         static, points, None, tracked, box_residual(tracked, points), state, *rest
                     )
 
-                programs[key] = quick_jit(corrected)
+                programs[key] = quick_jit(update)
             points = in_camera(INSIDE, tracked if fits == "track" else static)
             state = {"variance": np.float32(variance) * np.ones(3, np.float32), "lost": lost}
-            state |= {"vote": np.zeros(24, np.float32), "trial": np.int32(trial)}
-            static = replace(static, sure=np.float32(sure))
+            state |= {
+                "rotation_votes": np.zeros(24, np.float32),
+                "init_frames_left": np.int32(trial),
+            }
+            static = replace(static, confidence=np.float32(sure))
             said = programs[key](static, points, tracked, state, due, num_inconsistent, turned)
-            fix, found = said.fix, (said.variance, said.asked, said.replaced)
-            assert said.sure == (bool(said.asked) and (sure >= 0.5 or num_inconsistent >= 5))
-            assert said.vote.any() == (bool(said.sure) and trial > 0)
+            fix, found = said.measurement, (said.variance, said.estimator_queried, said.replaced)
+            assert said.accepted == (
+                bool(said.estimator_queried) and (sure >= 0.5 or num_inconsistent >= 5)
+            )
+            assert said.rotation_votes.any() == (bool(said.accepted) and trial > 0)
             along = np.linalg.inv(tracked.root) @ np.asarray(fix.root, float)
             turned = Rotation.from_matrix(along[:3, :3]).as_rotvec()[1]
             lid = Rotation.from_matrix(fix.parts[1, :3, :3]).as_rotvec()
@@ -437,8 +447,8 @@ class TestCorrected:
         assert not asked and not replaced
 
 
-class TestAveraged:
-    mean = staticmethod(quick_jit(averaged))
+class TestUpdateParameters:
+    mean = staticmethod(quick_jit(update_parameters))
 
     def frames(self, count):
         """ObjectParameters of two joints, as noisy as networks see them."""
@@ -450,17 +460,17 @@ class TestAveraged:
                 pivot=np.float32(rng.normal(size=(2, 3))),
                 size=np.float32(rng.uniform(1, 2, (3, 3))),
                 center=np.float32(rng.normal(size=(3, 3))),
-                seen=np.float32(1),
+                num_frames=np.float32(1),
                 known=np.zeros(2, np.float32),
             )
 
     def test_running_means(self):
         frames = list(self.frames(30))
         # Whatever was there before the first frame does not count.
-        found = replace(frames[-1], seen=np.float32(0))
+        found = replace(frames[-1], num_frames=np.float32(0))
         for frame in frames:
             found = self.mean(found, frame)
-        assert found.seen == 30
+        assert found.num_frames == 30
         for name in ("pivot", "size", "center"):
             expected = np.mean([getattr(frame, name) for frame in frames], 0)
             np.testing.assert_allclose(getattr(found, name), expected, atol=1e-5)
@@ -473,7 +483,7 @@ class TestAveraged:
     def test_old_frames_are_forgotten(self):
         """After an hour, what the object looks like now still counts a sixtieth."""
         old, new = self.frames(2)
-        found = self.mean(replace(old, seen=np.float32(1e5)), new)
+        found = self.mean(replace(old, num_frames=np.float32(1e5)), new)
         np.testing.assert_allclose(found.size - old.size, (new.size - old.size) / 61, atol=1e-5)
 
     def test_known_joints_hardly_move(self):

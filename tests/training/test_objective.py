@@ -16,7 +16,8 @@ from caper_jax.articulation.symmetry import apply_symmetry
 from caper_jax.config import LossConfig, LossWeights, RotationClassifierConfig
 from caper_jax.geometry.frames import view_rotation
 from caper_jax.lie import se3, so3
-from caper_jax.models.networks import PartsOutput, RootOutput
+from caper_jax.models.parts import PartsOutput
+from caper_jax.models.root import RootOutput
 from caper_jax.models.rotation_classes import CUBE_ROTATIONS, HALF_TURNS
 from caper_jax.training import memory
 from caper_jax.training.objective import Objective, rotate_references, stage1_loss, stage2_loss
@@ -71,7 +72,7 @@ class Oracle(Objective):
                 view @ pose.rotation[:, 0],
                 unit * (view * pose.translation[:, 0, None, :]).sum(-1),
             ),
-            turn=None,
+            rotation_class=None,
             segmentation=100.0 * jax.nn.one_hot(labels[:, ::stride], category.num_parts),
             heatmap=jnp.where(voting, jnp.exp(-distance), 0.0),
             offset=offset,
@@ -354,7 +355,7 @@ def outputs_and_targets(objective, batch, off_by):
     count, parts = len(batch.points), objective.category.num_parts
     outputs = PartsOutput(
         increment=targets.increment + 0.1,
-        turn=jnp.zeros((count, 24)) if off_by is not None else None,
+        rotation_class=jnp.zeros((count, 24)) if off_by is not None else None,
         segmentation=jnp.zeros((*batch.labels.shape, parts)),
         heatmap=jnp.ones((*batch.labels.shape, parts - 1)),
         offset=truth.joint_pivot[:, None] - batch.points[:, :, None],

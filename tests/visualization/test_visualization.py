@@ -260,7 +260,7 @@ def test_demo_writes_pictures_and_a_page_and_prints_errors(tmp_path, monkeypatch
             labels=np.zeros((1, points.shape[1] // 2), np.int32),
             confidence=np.ones((1, 2), np.float32),
             degenerate=np.zeros(1, bool),
-            seen=np.full((1, 2), 99, np.int32),
+            points_per_part=np.full((1, 2), 99, np.int32),
             evidence=np.zeros((1, 2, 6), np.float32),
         )
 

@@ -1,22 +1,29 @@
 """python run.py cloud.npy poses.npz: poses from a cloud [N, 3] or a batch [B, N, 3], in meters.
 
-Camera frame: x right, y down, z forward. Needs jax and numpy, nothing else. manifest.json says
-what comes out. In a program: ``from run import estimate, sample``."""
+Camera frame: x right, y down, z forward. Needs jax, numpy and flatbuffers, nothing else.
+manifest.json says what comes out, in which frame and unit. In a program that serves::
+
+    from run import estimate, sample, warm_up
+    warm_up()                                   # compiles; from then on a call takes milliseconds
+    poses = estimate(sample(cloud)[None])
+"""
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jax import ShapeDtypeStruct, export, jit, lax, tree
+from jax import block_until_ready, export, jit, tree
 
 MANIFEST = json.loads(Path(__file__).with_name("manifest.json").read_text("utf-8"))
-SHAPE, OUTPUTS = MANIFEST["inputs"]["points"]["shape"], MANIFEST["outputs"]
+SHAPE = MANIFEST["inputs"]["points"]["shape"]  # [batch, points, 3]; an open batch is a string
+MODEL = export.deserialize(bytearray(Path(__file__).with_name(MANIFEST["model"]).read_bytes()))
+estimate = jit(MODEL.call)
 
 
-def outline(x):  # the model's inputs and outputs; what happens in between is in its file
-    return {k: lax.full((*x.shape[:1], *v["shape"][1:]), 0, v["dtype"]) for k, v in OUTPUTS.items()}
+def warm_up(batch=1):  # compiles for this batch, or for the one of the model
+    size = batch if isinstance(SHAPE[0], str) else SHAPE[0]
+    block_until_ready(estimate(np.ones((size, *SHAPE[1:]), np.float32)))
 
 
 def sample(points):  # without what is no measurement, as many points as the model takes, evenly
@@ -28,11 +35,6 @@ def sample(points):  # without what is no measurement, as many points as the mod
         points = points[np.lexsort((y % 1 * 8 // 1, np.where(y % 2 < 1, x, -x) // 1, y // 1))]
     return points[((np.arange(SHAPE[1]) + 0.5) * len(points) / SHAPE[1]).astype(int)]
 
-
-like = ShapeDtypeStruct(export.symbolic_shape(", ".join(map(str, SHAPE))), np.float32)
-outlined = export.export(jit(outline, keep_unused=True), platforms=MANIFEST["platforms"])(like)
-model = Path(__file__).with_name("model.stablehlo").read_bytes()
-estimate = jit(replace(outlined, mlir_module_serialized=model, **MANIFEST["convention"]).call)
 
 if __name__ == "__main__":
     source, target = sys.argv[1:] if len(sys.argv) == 3 else sys.exit(__doc__)

@@ -34,7 +34,7 @@ import jax
 import numpy as np
 
 from caper_jax.articulation.category import Category
-from caper_jax.articulation.joints import joint_transform
+from caper_jax.articulation.kinematics import joint_transform
 from caper_jax.errors import CaperError, unknown_name
 
 

@@ -117,7 +117,7 @@ def _followed(mimic: tuple[str, float, float], states: Mapping[str, float]) -> f
 
 
 def joint_motion(kind: str, axis: np.ndarray, pivot: np.ndarray, state: float) -> np.ndarray:
-    """Float64 twin of ``articulation.joints.joint_transform``: a turn or slide [4, 4]."""
+    """Float64 twin of ``articulation.kinematics.joint_transform``: a turn or slide [4, 4]."""
     motion = np.eye(4)
     if kind == "prismatic":
         motion[:3, 3] = state * axis

@@ -12,6 +12,7 @@ from __future__ import annotations
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from caper_jax.config import FastEncoderConfig
 from caper_jax.models.encoders.features import Features, Level
@@ -19,16 +20,18 @@ from caper_jax.models.encoders.neighbors import squared_distances
 from caper_jax.models.layers import BatchNorm, Dense, max_over_points
 
 
-def local_moments(centers, points, scale):
+def local_moments(
+    centers: Float[Array, "B M 3"], points: Float[Array, "B N 3"], scale: Float[Array, "B"]
+) -> Float[Array, "B M 11"]:
     """Weighted mean, covariance and density of the points around each center.
 
     Args:
-      centers: [B, M, 3].
-      points: [B, N, 3].
-      scale: [B] standard deviation of the Gaussian window, same unit.
+      centers: where.
+      points: the cloud.
+      scale: standard deviation of the Gaussian window, same unit.
 
     Returns:
-      [B, M, 11]: covariance over its trace (6), mean offset (3) and radius (1) in windows, share
+      Covariance over its trace (6), mean offset (3) and radius (1) in windows, share
       of all points (1). All are independent of the unit.
     """
     scale = scale[:, None, None]
@@ -63,8 +66,8 @@ class FastEncoder(nn.Module):
     config: FastEncoderConfig = FastEncoderConfig()
 
     @nn.compact
-    def __call__(self, points, train: bool) -> Features:
-        """points [B, N, 3], network units -> Features at ``centers`` points."""
+    def __call__(self, points: Float[Array, "B N 3"], train: bool) -> Features:
+        """Points in network units -> Features at ``centers`` points."""
         config = self.config
 
         def norm_relu(features):

@@ -8,9 +8,10 @@ from typing import Any
 import flax.linen as nn
 import flax.struct
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from caper_jax.models.encoders.neighbors import gather
-from caper_jax.models.layers import Dense, product
+from caper_jax.models.layers import Dense, mixed_precision_dot
 
 
 @flax.struct.dataclass
@@ -18,16 +19,16 @@ class Level:
     """Features of a subset of the points.
 
     Attributes:
-      features: [B, M, C].
+      features: one row per point of the subset.
       upsample: how rows come back to the N input points: [B, N] the row nearest to each point,
         or [B, N, M] weights that sum to one; None when the rows are the points themselves.
     """
 
-    features: Any
-    upsample: Any = None
+    features: Float[Array, "B M C"]
+    upsample: Int[Array, "B N"] | Float[Array, "B N M"] | None = None
 
-    def at_points(self, values):
-        """Rows [B, M, C] brought to the input points, [B, N, C]."""
+    def at_points(self, values: Float[Array, "B M C"]) -> Float[Array, "B N C"]:
+        """Rows of the subset brought to the input points."""
         if self.upsample is None:
             return values
         if self.upsample.ndim == 3:
@@ -40,14 +41,14 @@ class Features:
     """Encoder output.
 
     Attributes:
-      points: [B, N, 3] the centered input cloud.
+      points: the centered input cloud.
       levels: fine to coarse.
-      shared: [B, G] global feature, or None.
+      shared: global feature, or None.
     """
 
-    points: Any
+    points: Float[Array, "B N 3"]
     levels: tuple[Level, ...]
-    shared: Any = None
+    shared: Float[Array, "B G"] | None = None
 
     def every(self, stride: int) -> Features:
         """The same features at every stride-th input point."""
@@ -77,11 +78,11 @@ class BlockDense(nn.Module):
 
     width: int
     with_points: bool = False
-    dot_general: Any = product
+    dot_general: Any = mixed_precision_dot
 
     @nn.compact
-    def __call__(self, features: Features):
-        """Features -> [B, N, width]."""
+    def __call__(self, features: Features) -> Float[Array, "B N C"]:
+        """Features -> ``width`` channels at every point."""
         dense = partial(Dense, self.width, dot_general=self.dot_general)
         total: Any = 0.0
         for number, level in enumerate(features.levels):

@@ -9,6 +9,7 @@ import flax.linen as nn
 import flax.struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from caper_jax.config import HSEncoderConfig
 from caper_jax.models.encoders.features import Features, Level
@@ -41,8 +42,10 @@ class OutlierRobust(nn.Module):
     """
 
     @nn.compact
-    def __call__(self, features, around):
-        """features [B, N, C], around [B, N, k] neighbors in space -> [B, N, C]."""
+    def __call__(
+        self, features: Float[Array, "B N C"], around: Int[Array, "B N k"]
+    ) -> Float[Array, "B N C"]:
+        """Features and each point's neighbors in space -> features."""
         channels = features.shape[-1]
         shared = neighbor_max(features, around).mean(1, keepdims=True)
         own = dense(channels, use_bias=False, name="own")(features)
@@ -61,17 +64,20 @@ class HSLayer(Weights, nn.Module):
     supports: int
 
     @nn.compact
-    def __call__(self, points, features, scope, around):
+    def __call__(
+        self,
+        points: Float[Array, "B N 3"],
+        features: Float[Array, "B N C"] | None,
+        scope: Int[Array, "B N k"],
+        around: Int[Array, "B N n"],
+    ) -> Float[Array, "B N D"]:
         """Convolves over ``scope`` and makes the result robust over ``around``.
 
         Args:
-          points: [B, N, 3].
-          features: [B, N, C_in], or None for the surface layer.
-          scope: [B, N, k] receptive field (neighbors in feature space, or in space).
-          around: [B, N, k'] neighbors in space.
-
-        Returns:
-          [B, N, C].
+          points: the cloud.
+          features: of the last layer, or None for the surface layer.
+          scope: receptive field (neighbors in feature space, or in space).
+          around: neighbors in space.
         """
         width = self.supports * self.channels
         scale = width if features is None else self.channels * (self.supports + 1)
@@ -101,18 +107,20 @@ class Neighborhoods:
     """Which points are near which in space; a rigid motion of the cloud does not change it.
 
     Attributes:
-      around: per resolution, [B, N, k] the neighbors of each point, nearest first.
-      kept: per pooling, [B, N / 4] the rows that it keeps.
-      upsample: per pooling, [B, N] the row it kept that is nearest to each input point.
+      around: per resolution, the neighbors of each point, nearest first.
+      kept: per pooling, the N / 4 rows that it keeps.
+      upsample: per pooling, the row it kept that is nearest to each input point.
     """
 
-    around: tuple[Any, ...]
-    kept: tuple[Any, ...]
-    upsample: tuple[Any, ...]
+    around: tuple[Int[Array, "B M k"], ...]
+    kept: tuple[Int[Array, "B M"], ...]
+    upsample: tuple[Int[Array, "B N"], ...]
 
 
-def neighborhoods(points, config: HSEncoderConfig, keys=(None, None)) -> Neighborhoods:
-    """The neighborhoods of points [B, N, 3] at N, N/4 and N/16 of them.
+def neighborhoods(
+    points: Float[Array, "B N 3"], config: HSEncoderConfig, keys=(None, None)
+) -> Neighborhoods:
+    """The neighborhoods of points at N, N/4 and N/16 of them.
 
     Args:
       points: the cloud.
@@ -151,9 +159,16 @@ class HSEncoder(nn.Module):
 
     config: HSEncoderConfig = HSEncoderConfig()
 
+    @nn.nowrap
+    def neighborhoods(self, points: Float[Array, "B N 3"]) -> Neighborhoods:
+        """``neighborhoods`` as evaluation pools them."""
+        return neighborhoods(points, self.config)
+
     @nn.compact
-    def __call__(self, points, train: bool, space: Neighborhoods | None = None) -> Features:
-        """points [B, N, 3], centered, network units -> Features at N, N/4 and N/16 points.
+    def __call__(
+        self, points: Float[Array, "B N 3"], train: bool, space: Neighborhoods | None = None
+    ) -> Features:
+        """Points, centered, network units -> Features at N, N/4 and N/16 points.
 
         In training the pooled subset is drawn from the rng stream "sample", per cloud; in
         evaluation it is every fourth point. ``space`` saves finding the neighbors again.

@@ -11,8 +11,7 @@ from _helpers import solid_points
 from scipy.spatial.transform import Rotation
 
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solid_bounds import bounds
-from caper_jax.geometry.solids import Solid, box, cone, cylinder, ellipsoid, frustum
+from caper_jax.geometry.solids import Solid, bounds, box, cone, cylinder, ellipsoid, frustum
 
 KINDS = ("box", "cylinder", "ellipsoid", "frustum", "cone")
 

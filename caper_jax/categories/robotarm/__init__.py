@@ -1,7 +1,7 @@
 """robotarm: seven links in a row, from the base (root) to the tip, with six revolute joints.
 
 y is up from the base and z forward. Rest is the pose of zero joint angles, which every family of
-arms has its own of (robotarm_chains.py). At rest each joint axis lies along a canonical axis, and
+arms has its own of (chains.py). At rest each joint axis lies along a canonical axis, and
 a state is positive about its positive direction: +y where the axis is vertical, +x where it lies
 across, +z where it points forward. So a positive turn about a vertical axis takes forward (z) to
 the side (x), and a positive pitch leans what stands upright (y) forward (z).
@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
-from caper_jax.categories import robotarm_chains as chains
 from caper_jax.categories.forms import about, along
+from caper_jax.categories.robotarm import chains
 from caper_jax.geometry.solids import Solid, box, cone, cylinder, ellipsoid, frustum
 
 _UNIT = dict(zip("xyz", np.eye(3), strict=True))

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
-from caper_jax.categories import cabinet
-from caper_jax.categories.cabinet import Plan
-from caper_jax.categories.furniture import TURN_Y, Handle, HandleStyle, StandStyle, stand
+from caper_jax.categories.drawer import cabinet
+from caper_jax.categories.drawer.cabinet import Plan
+from caper_jax.categories.forms import TURN_Y, Handle, HandleStyle, StandStyle, stand
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid, frustum
 
 

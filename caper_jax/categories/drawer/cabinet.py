@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caper_jax.categories.furniture import TURN_X, TURN_Y, Handle, StandStyle
+from caper_jax.categories.forms import TURN_X, TURN_Y, Handle, StandStyle
 from caper_jax.geometry.solids import Solid, box, cylinder, frustum
 
 # Probability, and ranges of width, height (without stand) and depth in meters.

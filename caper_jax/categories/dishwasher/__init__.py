@@ -1,6 +1,6 @@
 """dishwasher: a body (root) and a door hinged along x at its lower front edge; y up, front +z.
 
-The door is built shut, as ``dishwasher_body`` measures it, and opened by 90 deg for the rest pose.
+The door is built shut, as body.py measures it, and opened by 90 deg for the rest pose.
 """
 
 from __future__ import annotations
@@ -10,10 +10,8 @@ import itertools
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
-from caper_jax.categories.dishwasher_body import TYPES, Plan, body, controls, draw_plan
-from caper_jax.categories.dishwasher_inside import inside
-from caper_jax.categories.forms import about, turned
-from caper_jax.categories.furniture import TURN_X, TURN_Y, Handle, HandleStyle
+from caper_jax.categories.dishwasher.body import TYPES, Plan, body, controls, draw_plan, inside
+from caper_jax.categories.forms import TURN_X, TURN_Y, Handle, HandleStyle, about, rotated
 from caper_jax.geometry.solids import Solid, box, cylinder, frustum
 
 _OPEN = about("x", np.pi / 2)  # takes the shut door (y up) to the open one (towards +z)
@@ -147,7 +145,7 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     solids = body(rng, plan, kind, fascia)
     solids += inside(rng, plan.cavity, plan.plug, kind == "table_top")
     pivot = np.array([0.0, *plan.hinge])
-    door = [turned(solid, _OPEN, pivot) for solid in _door(rng, plan, kind, fascia)]
+    door = [rotated(solid, _OPEN, pivot) for solid in _door(rng, plan, kind, fascia)]
     limits = np.array([[-np.pi / 2, 0.0]])
     return ObjectModel([solids, door], np.array([[1.0, 0.0, 0.0]]), pivot[None], limits)
 

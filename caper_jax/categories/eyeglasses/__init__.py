@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
-from caper_jax.categories import eyeglasses_front as fronts
+from caper_jax.categories.eyeglasses import front as fronts
 from caper_jax.categories.forms import about, beam, mirrored
 from caper_jax.geometry.solids import Solid, ellipsoid
 
