@@ -89,7 +89,7 @@ class PartsTargets:
       size: [B, K, 3] residual to the category's mean.
       center: [B, K, 3] residual to the category's mean.
       increment: [B, 6] or [B, 9] from the reference to the true root (Eq 10), see
-        ``models.increment``.
+        ``models.parts``.
       rotation_class: [B] by which cube rotation the reference is off; 0 for none.
     """
 
