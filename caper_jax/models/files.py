@@ -72,7 +72,7 @@ def write_model(directory: str | Path, variables: PyTree, card: dict[str, Any]) 
     arrays = {name: _compact(name, leaf) for name, leaf in flatten(variables).items()}
     text = _card_text(card)
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     directory.mkdir(parents=True, exist_ok=True)
     write_atomically(directory / WEIGHTS_FILE, buffer.getvalue())
     write_atomically(directory / CARD_FILE, text)

@@ -235,7 +235,7 @@ class _Run:
         steps = np.arange(self.step, self.step + count)
         progress = np.array([self.fraction(step, elapsed) for step in steps.tolist()])
         factor = flat_and_anneal(progress, steps, self.config.warmup)
-        return progress.astype(np.float32), factor.astype(np.float32)
+        return progress.astype(np.float32), np.asarray(factor, np.float32)
 
     def read(self) -> None:
         """Log the dispatch that is still unread; waits for it."""

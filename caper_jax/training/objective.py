@@ -134,8 +134,8 @@ def stage2_loss(outputs: PartsOutput, targets: PartsTargets, config: LossConfig)
       {name of a weight: [B]}, and "total" [B].
     """
     axis, pivot = vote(targets.points, outputs.heatmap, outputs.offset, outputs.direction)
-    voting = targets.heatmap is not None and targets.offset is not None
-    if not voting:  # not of unit length: from an axis that points back no gradient leads here
+    heatmap, offset = targets.heatmap, targets.offset
+    if heatmap is None:  # not of unit length: from an axis that points back no gradient leads here
         axis = outputs.direction[:, 0]
     terms = {
         "location": losses.location_loss(
@@ -143,9 +143,9 @@ def stage2_loss(outputs: PartsOutput, targets: PartsTargets, config: LossConfig)
         ),
         "direction": losses.direction_loss(axis, targets.joint_axis),
     }
-    if voting:
-        terms["heatmap"] = losses.heatmap_loss(outputs.heatmap, targets.heatmap)
-        terms["offset"] = losses.offset_loss(outputs.offset, targets.offset, targets.heatmap)
+    if heatmap is not None and offset is not None:
+        terms["heatmap"] = losses.heatmap_loss(outputs.heatmap, heatmap)
+        terms["offset"] = losses.offset_loss(outputs.offset, offset, heatmap)
     terms |= {
         "state": losses.state_loss(outputs.state, targets.joint_state, config.state_penalty),
         "scale": losses.scale_loss(outputs.size, targets.size)
@@ -291,7 +291,8 @@ class Objective:
             reference = rotate_pose(reference, jnp.asarray(CUBE_ROTATIONS)[rotation_class])
         targets = self._parts_targets(
             canonical[:, ::stride], result.labels[:, ::stride], result.truth, reference
-        ).replace(rotation_class=rotation_class)
+        )
+        targets = replace(targets, rotation_class=rotation_class)
         terms = stage2_loss(outputs, targets, self.config)
         metrics = result.metrics | self._parts_metrics(outputs, targets, terms)
         error = so3.geodesic_distance(root[0], result.truth.rotation[:, 0])
@@ -456,12 +457,11 @@ class Objective:
         if outputs.rotation_class is not None:
             right = outputs.rotation_class.argmax(-1) == targets.rotation_class
             metrics["rotation_class_accuracy"] = right.mean()
-        kind = self.network.increment
-        said, true = (
-            increment_transform(numbers, kind)[:, :3, :3]
+        predicted, true = (
+            increment_transform(numbers, self.network.increment)[:, :3, :3]
             for numbers in (outputs.increment, targets.increment)
         )
-        off = stop_gradient(so3.geodesic_distance(said, true))
+        off = stop_gradient(so3.geodesic_distance(predicted, true))
         metrics["increment_deg"] = jnp.degrees(off).mean()
         return metrics
 

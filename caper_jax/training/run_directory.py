@@ -90,7 +90,7 @@ def _with_defaults(stored: dict[str, Any], given: dict[str, Any], kind: type) ->
                 filled[name] = _plain(field.default)
         elif isinstance(stored[name], dict) and isinstance(given[name], dict):
             options = (hints[name], *typing.get_args(hints[name]))  # T of T | None
-            section = next(t for t in options if dataclasses.is_dataclass(t))
+            section: Any = next(t for t in options if dataclasses.is_dataclass(t))
             filled[name] = _with_defaults(stored[name], given[name], section)
     return filled
 

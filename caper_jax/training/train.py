@@ -200,10 +200,11 @@ def _fit_dataset(
     """Trains on a dataset; also a function that reads some of its frames."""
     source = config.loader
     assert source is not None
+    known: Any = category  # a name or the object itself, as ``categories.get`` takes both
     dataset = open_dataset(
         source.format,
         source.root,
-        category,
+        known,
         source.split,
         num_points=4 * config.network.num_points,  # every epoch picks others of them
     )
