@@ -37,7 +37,7 @@ from caper_jax.synthetic.frames import Generator
 from caper_jax.synthetic.videos import VideoGenerator
 from caper_jax.training.objective import Objective
 from caper_jax.training.optimizer import Optimizer
-from caper_jax.training.step import TrainState, make_step
+from caper_jax.training.step import TrainState, compile_step
 
 DEMO = Path(caper.__file__).parent / "assets" / "demo"
 SMALL = HeadConfig(widths=(16, 16, 16))
@@ -104,7 +104,7 @@ def training(encoder: str) -> dict[str, np.ndarray]:
     optimizer = Optimizer(name=name, learning_rate=1e-3)
     variables = task.init(jax.random.key(0))
     state = TrainState.create(variables, optimizer, 3)
-    step = make_step(task.loss, optimizer)
+    step = compile_step(task, optimizer)
     metrics = []
     for number in range(3):
         data = generator.batch(jax.random.key(number), 4)

@@ -35,14 +35,14 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     from caper_jax.data.readers import open_dataset
     from caper_jax.training import train as training
     from caper_jax.training.objective import Objective
-    from caper_jax.training.optimizer import optimizer_of
-    from caper_jax.training.step import TrainState, make_step
+    from caper_jax.training.optimizer import Optimizer
+    from caper_jax.training.step import TrainState, compile_step
 
     config = training.preset("fast", arguments.category)
     dataset = open_dataset(arguments.format, arguments.data, arguments.category, arguments.split)
     task = Objective(dataset.category, config.network, config.loss)
-    optimizer = optimizer_of(config.training)
-    step = make_step(task.loss, optimizer)
+    optimizer = Optimizer.of(config.training)
+    step = compile_step(task, optimizer)
     state = TrainState.create(task.init(jax.random.key(0)), optimizer, 0)
     size = config.training.batch_size
     numbers = np.zeros(1, np.float32), np.ones(1, np.float32)

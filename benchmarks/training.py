@@ -108,7 +108,7 @@ def make(
       batch: samples per step over all devices; by default the preset's.
       count: steps per call.
       mesh: devices that share the batch.
-      batch_norm: "global" or "local", see ``training.state.make_step``.
+      batch_norm: "global" or "local", see ``training.step.compile_step``.
     """
     import jax
     import numpy as np
@@ -117,8 +117,8 @@ def make(
     from caper_jax.training import parallel
     from caper_jax.training import train as training
     from caper_jax.training.objective import Objective
-    from caper_jax.training.optimizer import optimizer_of
-    from caper_jax.training.step import TrainState, make_step
+    from caper_jax.training.optimizer import Optimizer
+    from caper_jax.training.step import TrainState, compile_step
 
     config = training.preset(preset, category)
     size = batch or config.training.batch_size
@@ -126,9 +126,9 @@ def make(
     task = Objective(task_category, config.network, config.loss)
     data = replace(config.data, instances=200)
     generator = Generator(task_category, data, split="train")
-    optimizer = optimizer_of(config.training)
-    function: Any = make_step(
-        task.loss,
+    optimizer = Optimizer.of(config.training)
+    function: Any = compile_step(
+        task,
         optimizer,
         batch_fn=lambda key, bank: generator.draw(key, size, bank),
         mesh=mesh,

@@ -374,6 +374,8 @@ class TrainingConfig:
       max_bad_steps: stop after so many steps without a finite gradient in a row.
       batch_norm: over several devices: "global", as one device would train with the whole batch,
         or "local", each on its own rows, which needs one sum per step.
+      save_memory: compute the gradients of both stages one after the other, which holds half as
+        much at once; the numbers are the same to rounding.
     """
 
     ALTERNATIVES: typing.ClassVar = ("steps", "minutes")
@@ -394,6 +396,7 @@ class TrainingConfig:
     keep_checkpoints: Count = 3
     max_bad_steps: Count = 50
     batch_norm: BatchNormExtent = "global"
+    save_memory: bool = True
 
     def __post_init__(self) -> None:
         if (self.steps is None) == (self.minutes is None):

@@ -60,7 +60,7 @@ def run(options: Calibrate) -> int:
     weights, category = options.weights, options.category
     check_frame_count(options.frames)  # before anything is written
     if options.refiner:
-        fit_refiner.add_sides(
+        fit_refiner.add_refiner(
             weights, category, TRAINING_DATA, frames=options.refiner_frames, seed=options.seed
         )
     estimator = load(category, weights)

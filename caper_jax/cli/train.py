@@ -140,12 +140,12 @@ def _plot(category: str, out: Path) -> None:
     """Writes curves.png beside the metrics it shows."""
     import jax
 
-    from caper_jax.training.metrics_log import FILE, read_metrics
+    from caper_jax.training.run_directory import METRICS_FILE, read_metrics
     from caper_jax.visualization.plots import training_curves, write_plot
 
-    if jax.process_index() or not (out / FILE).is_file():
+    if jax.process_index() or not (out / METRICS_FILE).is_file():
         return
-    if rows := read_metrics(out / FILE):
+    if rows := read_metrics(out / METRICS_FILE):
         write_plot(out / "curves.png", training_curves(f"Training of {category}", rows))
 
 

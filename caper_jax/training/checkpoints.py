@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import copy
+import itertools
 import logging
 import warnings
 import zlib
@@ -42,9 +43,21 @@ class Checkpoints:
 
     def __init__(self, directory: str | Path, keep: int = 3) -> None:
         self.directory = Path(directory).absolute()
-        self._keep = keep
         self._unreadable: list[int] = []
-        self._manager = self._open()
+        # Orbax logs every save and every odd directory.
+        self._logger = logging.getLogger("absl")
+        self._level = self._logger.level
+        self._logger.setLevel(logging.ERROR)
+        self._manager = ocp.CheckpointManager(
+            self.directory,
+            options=ocp.CheckpointManagerOptions(
+                max_to_keep=keep, create=True, cleanup_tmp_directories=True
+            ),
+            item_handlers={  # named, so that metadata can be read before any save
+                "state": ocp.StandardCheckpointHandler(),
+                "note": ocp.JsonCheckpointHandler(),
+            },
+        )
 
     def __enter__(self) -> Checkpoints:
         return self
@@ -52,24 +65,10 @@ class Checkpoints:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def _open(self) -> ocp.CheckpointManager:
-        options = ocp.CheckpointManagerOptions(
-            max_to_keep=self._keep, create=True, cleanup_tmp_directories=True
-        )
-        with _quiet():
-            return ocp.CheckpointManager(
-                self.directory,
-                options=options,
-                item_handlers={  # named, so that metadata can be read before any save
-                    "state": ocp.StandardCheckpointHandler(),
-                    "note": ocp.JsonCheckpointHandler(),
-                },
-            )
-
     def steps(self) -> list[int]:
         """Steps on disk, oldest first, whether they can be read or not."""
-        with _quiet():
-            return sorted(self._manager.all_steps(read=True))
+        self._manager.reload()
+        return sorted(self._manager.all_steps())
 
     def save(self, step: int, state: PyTree, extra: dict[str, Any] | None = None) -> None:
         """Write a checkpoint in the background; the arrays may be donated once this returns.
@@ -82,15 +81,14 @@ class Checkpoints:
         Raises:
           CaperError: it was not written (a failure of an earlier background write included).
         """
-        self._move_unreadable_aside()
+        self._set_unreadable_aside()
         # A snapshot, since Orbax writes it later and the caller's dict lives on.
         note = copy.deepcopy({"extra": extra or {}, "checksums": _checksums(state)})
         arguments = ocp.args.Composite(
             state=ocp.args.StandardSave(state), note=ocp.args.JsonSave(note)
         )
         try:
-            with _quiet():
-                saved = self._manager.save(step, args=arguments, force=True)
+            saved = self._manager.save(step, args=arguments, force=True)
         except Exception as error:
             raise CaperError(f"{self.directory}: cannot save step {step}: {error}") from error
         if not saved:
@@ -114,12 +112,11 @@ class Checkpoints:
             template's, or checkpoints exist and none can be read.
         """
         abstract = jax.tree.map(_abstract, template)
-        steps = self.steps()
         self._unreadable, failures = [], []
-        for step in reversed(steps):
+        for step in reversed(self.steps()):
             where = self.directory / str(step)
             try:
-                with _quiet(), _orderly_failures():
+                with _orderly_failures():
                     restored = self._read(step, abstract)
             except CaperError:
                 raise
@@ -137,7 +134,7 @@ class Checkpoints:
         if failures:
             raise CaperError(
                 f"no checkpoint can be read: {'; '.join(failures)}; "
-                f"move {self.directory} away to start anew"
+                f"move {self.directory} away to start over"
             )
         return None
 
@@ -151,39 +148,33 @@ class Checkpoints:
         )
         restored = self._manager.restore(step, args=arguments)
         state, note = restored["state"], restored["note"]
-        found = _checksums(state)
-        damaged = [name for name, value in note["checksums"].items() if found.get(name) != value]
+        actual = _checksums(state)
+        damaged = [name for name, value in note["checksums"].items() if actual.get(name) != value]
         if damaged:
             raise ValueError(f"checksum of {damaged[0]} differs")
         return state, note["extra"]
 
-    def _move_unreadable_aside(self) -> None:
+    def _set_unreadable_aside(self) -> None:
         """Free the numbers of damaged steps, and keep retention from counting them."""
         if not self._unreadable:
             return
-        self._manager.close()
         if jax.process_index() == 0:
             for step in self._unreadable:
-                source = self.directory / str(step)
-                target = source.with_name(source.name + _UNREADABLE)
-                number = 1
-                while target.exists():
-                    number += 1
-                    target = source.with_name(f"{source.name}{_UNREADABLE}{number}")
-                source.rename(target)
+                names = (f"{step}{_UNREADABLE}{n or ''}" for n in itertools.count())
+                free = (path for name in names if not (path := self.directory / name).exists())
+                (self.directory / str(step)).rename(next(free))
         if jax.process_count() > 1:
             from jax.experimental import multihost_utils
 
-            multihost_utils.sync_global_devices("caper_jax.checkpoints.move_aside")
+            multihost_utils.sync_global_devices("caper_jax.checkpoints.set_aside")
         self._unreadable = []
-        self._manager = self._open()
+        self._manager.reload()
 
     def wait(self) -> None:
         """Block until the background write is on disk; CaperError if it failed."""
         try:
-            with _quiet():
-                self._manager.wait_until_finished()
-                self._manager.check_for_errors()
+            self._manager.wait_until_finished()
+            self._manager.check_for_errors()
         except Exception as error:
             raise CaperError(f"{self.directory}: the last save failed: {error}") from error
 
@@ -192,54 +183,8 @@ class Checkpoints:
         try:
             self.wait()
         finally:
-            with _quiet():
-                self._manager.close()
-
-
-def _abstract(leaf: Any) -> jax.ShapeDtypeStruct:
-    sharding = getattr(leaf, "sharding", None)
-    if sharding is None:
-        sharding = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
-
-
-def _leaves(tree: PyTree) -> dict[str, Any]:
-    """Leaves by "a/b/c" path; the same for a state and for Orbax's nested dicts of it."""
-    return {
-        jax.tree_util.keystr(path, simple=True, separator="/"): leaf
-        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
-    }
-
-
-def _compare(saved: dict[str, Any], wanted: dict[str, Any], where: str) -> None:
-    """Raise a CaperError naming the first leaf on which checkpoint and template disagree."""
-    for name in sorted(saved.keys() | wanted.keys()):
-        if name not in saved:
-            raise CaperError(f"checkpoint {where} has no {name!r}; it is of another model")
-        if name not in wanted:
-            raise CaperError(f"checkpoint {where} has {name!r}, which this model has not")
-        for field, have, want in (
-            ("shape", tuple(saved[name].shape), tuple(wanted[name].shape)),
-            ("dtype", np.dtype(saved[name].dtype).name, np.dtype(wanted[name].dtype).name),
-        ):
-            if have != want:
-                raise CaperError(
-                    f"checkpoint {where}: {name!r} has {field} {have}, this model needs {want}"
-                )
-
-
-def _checksums(tree: PyTree) -> dict[str, int]:
-    """CRC-32 of every leaf, by path."""
-    return {
-        name: zlib.crc32(np.ascontiguousarray(jax.device_get(leaf)).tobytes())
-        for name, leaf in _leaves(tree).items()
-    }
-
-
-def _brief(error: Exception) -> str:
-    """The first sentence of an error; TensorStore appends pages of its configuration."""
-    lines = str(error).strip().splitlines()
-    return lines[0].partition(". See full")[0][:200] if lines else type(error).__name__
+            self._manager.close()
+            self._logger.setLevel(self._level)
 
 
 class _PatientLoop(asyncio.SelectorEventLoop):
@@ -267,13 +212,45 @@ def _orderly_failures() -> Iterator[None]:
         asyncio.new_event_loop = new_event_loop
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep Orbax's log lines about every save and every odd directory off standard error."""
-    logger = logging.getLogger("absl")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
+def _abstract(leaf: Any) -> jax.ShapeDtypeStruct:
+    sharding = getattr(leaf, "sharding", None)
+    if sharding is None:
+        sharding = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+
+
+def _leaves(tree: PyTree) -> dict[str, Any]:
+    """Leaves by "a/b/c" path; the same for a state and for Orbax's nested dicts of it."""
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): leaf
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
+    }
+
+
+def _compare(saved: dict[str, Any], wanted: dict[str, Any], where: str) -> None:
+    """Raise a CaperError naming the first leaf on which checkpoint and template disagree."""
+    for name in sorted(saved.keys() | wanted.keys()):
+        if name not in saved:
+            raise CaperError(f"checkpoint {where} has no {name!r}; it is of another model")
+        if name not in wanted:
+            raise CaperError(f"checkpoint {where} has {name!r}, which this model has not")
+        have, want = (
+            f"shape {tuple(leaf.shape)} and dtype {np.dtype(leaf.dtype).name}"
+            for leaf in (saved[name], wanted[name])
+        )
+        if have != want:
+            raise CaperError(f"checkpoint {where}: {name!r} has {have}, this model needs {want}")
+
+
+def _checksums(tree: PyTree) -> dict[str, int]:
+    """CRC-32 of every leaf, by path."""
+    return {
+        name: zlib.crc32(np.ascontiguousarray(jax.device_get(leaf)).tobytes())
+        for name, leaf in _leaves(tree).items()
+    }
+
+
+def _brief(error: Exception) -> str:
+    """The first sentence of an error; TensorStore appends pages of its configuration."""
+    lines = str(error).strip().splitlines()
+    return lines[0].partition(". See full")[0][:200] if lines else type(error).__name__

@@ -1,7 +1,7 @@
-"""Fits the network that corrects estimates by the sides of their boxes (``models.refiner``).
+"""Fits the refiner (``models.refiner``) of a trained model.
 
-Both stages are trained and stay as they are. They read generated frames; what they are off by there
-is regressed on what the points say about their boxes, with the L1 losses of Eqs 17 to 21.
+Both stages stay as they are. They estimate poses on generated frames; what these are off by is
+regressed on what the points say about the estimated boxes, with the L1 losses of Eqs 17 to 21.
 """
 
 from __future__ import annotations
@@ -39,26 +39,26 @@ FRAMES = 40_000
 _SPLIT = "train"
 _BATCH = 512
 _STEPS = 6000  # at least
-_PASSES = 25  # over many frames
+_EPOCHS = 25  # over many frames
 _PER_CALL = 100  # steps compiled into one call
 _RATE = 2e-3
 _DECAY = 1e-3
 _DROPOUT = 0.1  # of features: frames are few
-_TURNED = np.radians(20.0)  # a root that is off by more lies in another box; nothing to learn
+_MAX_ROTATION = np.radians(20.0)  # a root that is off by more lies in another box
 _WEIGHTS = RefinerOutput(size=1.0, center=1.0, twist=4.0, pivot=2.0, state=2.0)
 
 
-class TurnedModel(CaperError):
-    """A model that is too wrong to be corrected by the sides of its boxes."""
+class UnreliableModel(CaperError):
+    """A model whose estimates are too wrong for a refiner to correct."""
 
 
-def fit_sides(
+def fit_refiner(
     estimator: Estimator, config: GeneratorConfig, width: int, frames: int = FRAMES, seed: int = 0
 ) -> dict[str, Any]:
     """Weights of a ``BoxRefiner`` for a trained model.
 
     Args:
-      estimator: the model; a network of this kind in it is not used.
+      estimator: the model; a refiner in it is not used.
       config: what half of the frames look like; the others have the sensors' noise alone. Of
         other shapes than those that a run with the same seed was trained on.
       width: of the network.
@@ -66,25 +66,25 @@ def fit_sides(
       seed: of shapes, frames and weights.
 
     Raises:
-      CaperError: too few frames; TurnedModel, a model that is turned in nearly all of them.
+      CaperError: too few frames; UnreliableModel, the root is badly rotated in nearly all of them.
     """
     check_frame_count(frames)
     network = replace(estimator.network, refiner=RefinerConfig())
-    first = _regressed(estimator, network, config, width, max(frames // 4, 2 * _BATCH), seed + 1)
-    # Then both what the stages find and what the first round makes of it.
+    first = _regress(estimator, network, config, width, max(frames // 4, 2 * _BATCH), seed + 1)
+    # Then on both what the stages estimate and what the first round makes of it.
     params = {**estimator.variables["params"], "refiner": first}
     estimator = Estimator(estimator.category, network, {**estimator.variables, "params": params})
     network = replace(network, refiner=RefinerConfig(width, iterations=1))
-    return _regressed(estimator, network, config, width, frames, seed + 2)
+    return _regress(estimator, network, config, width, frames, seed + 2)
 
 
 def check_frame_count(frames: int) -> None:
-    """Raises CaperError where so many frames are too few to fit sides on."""
+    """Raises CaperError where so many frames are too few to fit a refiner on."""
     if frames < 2 * _BATCH:
-        raise CaperError(f"fitting sides needs {2 * _BATCH} frames or more, got {frames}")
+        raise CaperError(f"fitting a refiner needs {2 * _BATCH} frames or more, got {frames}")
 
 
-def _regressed(
+def _regress(
     estimator: Estimator,
     network: NetworkConfig,
     config: GeneratorConfig,
@@ -92,10 +92,10 @@ def _regressed(
     frames: int,
     seed: int,
 ) -> dict[str, Any]:
-    """Weights regressed on what such a network finds, before and after its sides."""
+    """Weights regressed on the estimates of such a network, before and after its own refiner."""
     measure = jax.jit(partial(_measure, category=estimator.category, network=network))
     rows = []
-    title = "reading frames for sides"
+    title = "estimating poses for the refiner"
     for batch in mixed_frames(estimator, config, _SPLIT, frames, seed, title):
         rows += jax.device_get(measure(estimator.variables, batch))
     features, off, learn = (
@@ -103,50 +103,52 @@ def _regressed(
         for column in zip(*rows, strict=True)
     )
     if learn.mean() < 0.1:
-        raise TurnedModel(
-            f"the root is turned by more than {np.degrees(_TURNED):.0f} deg in "
+        raise UnreliableModel(
+            f"the root is off by more than {np.degrees(_MAX_ROTATION):.0f} deg in "
             f"{100 - 100 * learn.mean():.0f} % of {frames} frames: train the model longer before "
-            "its sides are fitted, or set network.refiner.width = 0"
+            "its refiner is fitted, or set network.refiner.width = 0"
         )
     features, off = jax.tree.map(lambda values: values[learn], (features, off))
     return _fit(features, off, width, estimator.category.num_parts, seed)
 
 
-def add_sides(
+def add_refiner(
     directory: str | Path,
-    category: str,
+    category: str | Category,
     config: GeneratorConfig,
     width: int | None = None,
     frames: int = FRAMES,
     seed: int = 0,
 ) -> None:
-    """Fits such a network for the model in a directory and writes it there, in place of an older.
+    """Fits a refiner for the model in a directory and writes it there, in place of an older one.
 
-    What the model said about its own errors is dropped from its card: it says less wrong now.
+    The calibration is dropped from the model's card: its errors are others now.
 
     Args:
       directory: of the model.
-      category: its name, or FILE.py:NAME.
-      width: of the network; None for that of the older, or of the fast preset's.
-      config, frames, seed: see ``fit_sides``.
+      category: its name, FILE.py:NAME, or the category itself.
+      width: of the network; None for that of the older one, or of the fast preset's.
+      config, frames, seed: see ``fit_refiner``.
 
     Raises:
-      CaperError: see ``fit_sides`` and ``estimator.load``; the model is left as it was.
+      CaperError: see ``fit_refiner`` and ``estimator.load``; the model is left as it was.
     """
     estimator = load(category, directory)
     card, variables = estimator.card, estimator.variables
     width = width or estimator.network.refiner.width or PRESETS["fast"].network.refiner.width
-    fitted = fit_sides(estimator, config, width, frames, seed)
+    fitted = fit_refiner(estimator, config, width, frames, seed)
     params = {**variables["params"], "refiner": fitted}
-    run = {**card["run"], "network": {**card["run"]["network"], "sides_width": width}}
+    network = card["run"]["network"]
+    refiner = {**network.get("refiner", {}), "width": width}
+    run = {**card["run"], "network": {**network, "refiner": refiner}}
     kept = {name: value for name, value in card.items() if name != "calibration"}
-    sides = {"frames": frames, "split": _SPLIT, "seed": seed}
-    write_model(directory, {**variables, "params": params}, {**kept, "run": run, "refiner": sides})
+    origin = {"frames": frames, "split": _SPLIT, "seed": seed}
+    write_model(directory, {**variables, "params": params}, {**kept, "run": run, "refiner": origin})
 
 
 def _measure(variables, batch: Batch, category: Category, network: NetworkConfig):
     """(features [B, F], RefinerOutput that would be right, whether to learn it [B]) of every
-    estimate: before and after each pass of the network's sides."""
+    estimate: before and after each iteration of the network's refiner."""
     view = view_rotation(batch.points, category.viewpoint.camera_roll)
     cloud = rotate(view, batch.points) * category.unit
     outputs = run_stages(variables, cloud, category, network)
@@ -155,7 +157,7 @@ def _measure(variables, batch: Batch, category: Category, network: NetworkConfig
         pose = articulated_pose(estimate, view, category)
         truth = nearer_symmetry(pose, batch.pose, category)
         off = difference(pose, truth, category)
-        learn = jnp.linalg.norm(off.twist[:, :3], axis=-1) < _TURNED
+        learn = jnp.linalg.norm(off.twist[:, :3], axis=-1) < _MAX_ROTATION
         rows.append((refiner_inputs(outputs, estimate, cloud, category), off, learn))
     return rows
 
@@ -186,15 +188,15 @@ def _fit(features: np.ndarray, off: RefinerOutput, width: int, num_parts: int, s
     mean, deviation = features.mean(0), features.std(0)
     scale = 1.0 / (deviation + 0.02)  # what never varies stays small
     params |= {"mean": jnp.asarray(mean), "scale": jnp.asarray(scale)}
-    calls = max(_STEPS, _PASSES * len(features) // _BATCH) // _PER_CALL
+    calls = max(_STEPS, _EPOCHS * len(features) // _BATCH) // _PER_CALL
     schedule = optax.cosine_decay_schedule(_RATE, calls * _PER_CALL)
     optimizer = optax.adamw(schedule, weight_decay=_DECAY)
 
     def loss(free, chosen, right, key):
         kept = jax.random.bernoulli(key, 1 - _DROPOUT, chosen.shape)
         chosen = jnp.where(kept, chosen, mean)
-        said = module.apply({"params": params | free}, chosen)
-        errors = jax.tree.map(lambda s, r: jnp.abs(s - r).mean(), said, right)
+        output = module.apply({"params": params | free}, chosen)
+        errors = jax.tree.map(lambda o, r: jnp.abs(o - r).mean(), output, right)
         return sum(jax.tree.leaves(jax.tree.map(jnp.multiply, _WEIGHTS, errors)))
 
     @jax.jit
@@ -213,7 +215,7 @@ def _fit(features: np.ndarray, off: RefinerOutput, width: int, num_parts: int, s
     data = jax.device_put((features, off))
     free = {name: value for name, value in params.items() if name not in ("mean", "scale")}
     carry = free, optimizer.init(free)
-    with progress("fitting sides", total=calls * _PER_CALL) as bar:
+    with progress("fitting the refiner", total=calls * _PER_CALL) as bar:
         for number in range(calls):
             own = jax.random.split(jax.random.fold_in(keys[1], number), _PER_CALL)
             carry, values = several(carry, own, data)

@@ -1,4 +1,4 @@
-"""Calibrates what a model says about its own errors (``caper_jax.models.uncertainty``)."""
+"""Calibrates a model's uncertainty (``caper_jax.models.uncertainty``) on generated frames."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
@@ -23,6 +24,7 @@ from caper_jax.models.uncertainty import COVERAGE
 from caper_jax.progress import progress
 from caper_jax.synthetic.frames import Generator
 from caper_jax.synthetic.sensor import CAMERAS
+from caper_jax.training.objective import where_samples
 
 FRAMES = 4096
 SPLIT = "val"
@@ -55,9 +57,9 @@ def calibrate(
         jax.device_get(measure(estimator.variables, batch))
         for batch in mixed_frames(estimator, config, SPLIT, frames, seed, "calibrating")
     ]
-    found, *errors = (np.concatenate(column)[:frames] for column in zip(*rows, strict=True))
-    low, high = np.quantile(found, [0.01, 0.99], axis=(0, 1))
-    inside = np.clip(found, low, high)
+    evidence, *errors = (np.concatenate(column)[:frames] for column in zip(*rows, strict=True))
+    low, high = np.quantile(evidence, [0.01, 0.99], axis=(0, 1))
+    inside = np.clip(evidence, low, high)
     rotation, translation, state = (
         [
             quantile_regression(inside[:, -count + k], np.log(np.maximum(error[:, k], _SMALLEST)))
@@ -108,7 +110,11 @@ def mixed_frames(
             bar.update(min(_BATCH, frames - start))
 
 
-def quantile_regression(inputs: np.ndarray, target: np.ndarray, level: float = COVERAGE):
+def quantile_regression(
+    inputs: Float[np.ndarray, "samples features"],
+    target: Float[np.ndarray, " samples"],
+    level: float = COVERAGE,
+) -> Float[np.ndarray, " coefficients"]:
     """Coefficients [F + 1], the constant last, of the linear ``level`` quantile.
 
     Minimizes the pinball loss by majorization: each step replaces |r| by a parabola that touches
@@ -122,13 +128,13 @@ def quantile_regression(inputs: np.ndarray, target: np.ndarray, level: float = C
     design = np.column_stack([inputs, np.ones(len(target))]).astype(np.float64)
     # A hair of ridge: evidence that never varies leaves its coefficient at zero.
     ridge = 1e-6 * len(target) * np.eye(design.shape[1])
-    found = np.linalg.solve(design.T @ design + ridge, design.T @ target)
+    solution = np.linalg.solve(design.T @ design + ridge, design.T @ target)
     for _ in range(_ITERATIONS):
-        weight = 1.0 / (np.abs(target - design @ found) + 1e-4)
+        weight = 1.0 / (np.abs(target - design @ solution) + 1e-4)
         weighted = design * weight[:, None]
         right = weighted.T @ target + (2.0 * level - 1.0) * design.sum(0)
-        found = np.linalg.solve(weighted.T @ design + ridge, right)
-    return found
+        solution = np.linalg.solve(weighted.T @ design + ridge, right)
+    return solution
 
 
 def _measure(variables, batch: Batch, estimator: Estimator):
@@ -138,25 +144,22 @@ def _measure(variables, batch: Batch, estimator: Estimator):
     pose, truth = prediction.pose, nearer_symmetry(prediction.pose, batch.pose, category)
     shift = (pose.translation - truth.translation) * category.unit
     state = jnp.abs(pose.joint_state - truth.joint_state) * category.state_units
-    turn = so3.geodesic_distance(pose.rotation, truth.rotation)
-    return prediction.evidence, turn, jnp.linalg.norm(shift, axis=-1), state
+    angle = so3.geodesic_distance(pose.rotation, truth.rotation)
+    return prediction.evidence, angle, jnp.linalg.norm(shift, axis=-1), state
 
 
-def nearer_symmetry(pose: ArticulatedPose, truth: ArticulatedPose, category: Category):
-    """The truth [B, ...]; of objects that a category declares ambiguous the reading that is nearer.
+def nearer_symmetry(
+    pose: ArticulatedPose, truth: ArticulatedPose, category: Category
+) -> ArticulatedPose:
+    """The truth [B, ...]; of objects that a category declares ambiguous that which is nearer.
 
     Nobody can know which of equal halves bears which name: an estimate need not doubt itself there.
     """
     for symmetry in category.symmetries:
         other = apply_symmetry(truth, symmetry, category)
-        turns = [
-            so3.geodesic_distance(pose.rotation[:, 0], reading.rotation[:, 0])
-            for reading in (other, truth)
+        angles = [
+            so3.geodesic_distance(pose.rotation[:, 0], one.rotation[:, 0]) for one in (other, truth)
         ]
-        nearer = is_ambiguous(truth.size, symmetry) & (turns[0] < turns[1])
-
-        def pick(new, old, nearer=nearer):
-            return jnp.where(nearer.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-        truth = jax.tree.map(pick, other, truth)
+        nearer = is_ambiguous(truth.size, symmetry) & (angles[0] < angles[1])
+        truth = where_samples(nearer, other, truth)
     return truth

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,13 +22,37 @@ from caper_jax.errors import CaperError
 from caper_jax.progress import progress as progress_display
 from caper_jax.training import parallel
 from caper_jax.training.checkpoints import Checkpoints
-from caper_jax.training.metrics_log import FILE, MetricsLog
-from caper_jax.training.optimizer import flat_and_anneal, optimizer_of
-from caper_jax.training.run_directory import check_configuration
-from caper_jax.training.signals import StopRequest
-from caper_jax.training.step import LossFn, TrainState, make_step
+from caper_jax.training.optimizer import Optimizer, flat_and_anneal
+from caper_jax.training.run_directory import METRICS_FILE, MetricsLog, check_configuration
+from caper_jax.training.step import LossFn, TrainState, compile_step
 
 PyTree = Any
+
+
+class StopRequest:
+    """Turns SIGTERM and the first Ctrl-C into a request to save and stop.
+
+    A second Ctrl-C interrupts at once. Outside the main thread signals are left alone.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> StopRequest:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGINT):
+                self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: Any) -> None:
+        if self.requested and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.requested = True
 
 
 @dataclass(frozen=True)
@@ -64,15 +90,15 @@ def fit(
     Args:
       directory: the run directory.
       config: how to train.
-      loss_fn: see `make_step`.
+      loss_fn: see `training.step.train_step`.
       variables: initial variables of the network; on resume their shapes and dtypes.
       batch_fn: ``(key) -> batch`` or ``(key, data) -> batch``, traced into the step.
       data: arrays handed to ``batch_fn`` besides the key, kept on the device.
       batches: instead of ``batch_fn``: ``(step) -> batch`` on the host, of which each process
         gives its own rows; a function of the step, so that a resumed run sees the same data.
       mesh: devices to split the batch over; one device without it.
-      description: what else defines the run (network, data); kept in config.json and compared
-        on resume. Must be JSON-serializable.
+      description: what else defines the run (the other sections of a ``RunConfig``, say); kept in
+        config.json and compared on resume. Must be JSON-serializable.
 
     Raises:
       CaperError: the directory holds a run of another configuration or cannot be read, a
@@ -88,9 +114,14 @@ def fit(
     directory = Path(directory)
     check_configuration(directory, {"training": dataclasses.asdict(config), **(description or {})})
 
-    optimizer = optimizer_of(config)
-    step_fn = make_step(
-        loss_fn, optimizer, batch_fn=batch_fn, mesh=mesh, batch_norm=config.batch_norm
+    optimizer = Optimizer.of(config)
+    step_fn = compile_step(
+        loss_fn,
+        optimizer,
+        batch_fn=batch_fn,
+        mesh=mesh,
+        batch_norm=config.batch_norm,
+        save_memory=config.save_memory,
     )
     sharding = parallel.replicated(mesh) if mesh is not None else parallel.one_device()
     state = parallel.place(TrainState.create(variables, optimizer, config.seed), sharding)
@@ -133,7 +164,7 @@ class _Run:
         self.elapsed_before = float(state.elapsed)
         self.began = self.saved_at = time.monotonic()
         self.metrics = MetricsLog(
-            directory / FILE if jax.process_index() == 0 else None,
+            directory / METRICS_FILE if jax.process_index() == 0 else None,
             self.step,
             config.log_steps,
             config.batch_size,
@@ -201,13 +232,10 @@ class _Run:
         count = self.config.steps_per_dispatch
         if self.config.steps is not None:
             count = min(count, self.config.steps - self.step)
-        steps = range(self.step, self.step + count)
-        progress = [self.fraction(step, elapsed) for step in steps]
-        factor = [
-            flat_and_anneal(p, step, self.config.warmup)
-            for p, step in zip(progress, steps, strict=True)
-        ]
-        return np.asarray(progress, np.float32), np.asarray(factor, np.float32)
+        steps = np.arange(self.step, self.step + count)
+        progress = np.array([self.fraction(step, elapsed) for step in steps.tolist()])
+        factor = flat_and_anneal(progress, steps, self.config.warmup)
+        return progress.astype(np.float32), np.asarray(factor, np.float32)
 
     def read(self) -> None:
         """Log the dispatch that is still unread; waits for it."""
@@ -220,10 +248,11 @@ class _Run:
             step = last - len(factors) + index + 1
             row = {name: values[index] for name, values in metrics.items()}
             self.metrics.add(step, row, factor, self.elapsed())
-            if self.metrics.bad_in_a_row >= self.config.max_bad_steps:
+            bad = self.metrics.averages.bad_in_a_row
+            if bad >= self.config.max_bad_steps:
                 raise CaperError(
                     f"training diverged: the loss or its gradient was not finite in the "
-                    f"{self.metrics.bad_in_a_row} steps up to step {step} (loss {row['loss']}); "
+                    f"{bad} steps up to step {step} (loss {row['loss']}); "
                     "lower the learning rate, or look for bad samples"
                 )
             self.factor = factor
@@ -246,7 +275,7 @@ class _Run:
             self.state, elapsed=parallel.place(elapsed, self.state.elapsed.sharding)
         )
         if self.step != self.saved_step:
-            self.checkpoints.save(self.step, self.state, {"metrics": self.metrics.to_dict()})
+            self.checkpoints.save(self.step, self.state, {"metrics": vars(self.metrics.averages)})
             self.saved_step = self.step
         self.saved_at = time.monotonic()
 

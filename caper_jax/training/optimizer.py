@@ -1,49 +1,49 @@
 """Optimizers and the flat-and-anneal schedule (Ranger, as used to train HS-Pose).
 
 Ranger is RAdam (Liu et al. 2020) on centralized gradients (Yong et al. 2020) inside Lookahead
-(Zhang et al. 2019). The optimizer state does not depend on the learning rate, which is why the
-builders below take the rate of *this* step, possibly a traced scalar: one compiled step serves a
-run bounded by steps and a run bounded by minutes.
+(Zhang et al. 2019). No optimizer's state depends on the learning rate, which is why the builders
+below take the rate of *this* step, possibly a traced scalar: one compiled step serves a run bounded
+by steps and a run bounded by minutes, and vmap trains with many rates side by side.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from caper_jax.config import OptimizerName, TrainingConfig
-from caper_jax.errors import CaperError, unknown_name
+from caper_jax.errors import unknown_name
 
 PyTree = Any
-OPTIMIZERS: tuple[OptimizerName, ...] = ("ranger", "adamw")
+ScalarLike = jax.typing.ArrayLike  # of shape []; may be traced
 
 _FLAT_UNTIL = 0.72  # progress at which the cosine begins
 _WARMUP_START = 0.001  # first factor of the linear warm-up
 
 
-def flat_and_anneal(progress: float, step: int, warmup: int) -> float:
+def flat_and_anneal(
+    progress: np.ndarray | float, step: np.ndarray | int, warmup: int
+) -> np.ndarray | np.floating:
     """Learning-rate factor: linear warm-up, flat to 72 % of the run, cosine to 0.
 
+    On the host, in float64: it must not wait for the device. Of many steps at once, for a scan.
+
     Args:
-      progress: fraction of the run that is done, in [0, 1].
-      step: number of steps done so far.
+      progress: [...] fraction of the run that is done, in [0, 1].
+      step: [...] number of steps done so far.
       warmup: steps of the warm-up from 0.001 to 1; 0 for none.
 
     Returns:
-      Factor in [0, 1] by which the base learning rate is multiplied.
+      [...] factor in [0, 1] by which the base learning rate is multiplied.
     """
-    ramp = 1.0
-    if step < warmup:
-        ramp = _WARMUP_START + (1.0 - _WARMUP_START) * step / warmup
-    if progress <= _FLAT_UNTIL:
-        return ramp
-    angle = math.pi * (min(progress, 1.0) - _FLAT_UNTIL) / (1.0 - _FLAT_UNTIL)
-    return ramp * 0.5 * (1.0 + math.cos(angle))
+    ramp = _WARMUP_START + (1.0 - _WARMUP_START) * np.asarray(step) / max(warmup, 1)
+    fall = np.clip((np.asarray(progress) - _FLAT_UNTIL) / (1.0 - _FLAT_UNTIL), 0.0, 1.0)
+    return np.where(np.asarray(step) < warmup, ramp, 1.0) * 0.5 * (1.0 + np.cos(np.pi * fall))
 
 
 def centralize_gradients() -> optax.GradientTransformation:
@@ -63,14 +63,14 @@ def centralize_gradients() -> optax.GradientTransformation:
 
 
 def ranger(
-    learning_rate: jax.typing.ArrayLike,
+    learning_rate: ScalarLike,
     *,
-    clip_norm: float = 5.0,
+    clip_norm: ScalarLike = 5.0,
     b1: float = 0.95,
     b2: float = 0.999,
     eps: float = 1e-5,
     threshold: float = 5.0,
-    weight_decay: float = 0.0,
+    weight_decay: ScalarLike = 0.0,
     sync_period: int = 6,
     slow_step_size: float = 0.5,
 ) -> optax.GradientTransformation:
@@ -102,13 +102,13 @@ def ranger(
 
 
 def adamw(
-    learning_rate: jax.typing.ArrayLike,
+    learning_rate: ScalarLike,
     *,
-    clip_norm: float = 5.0,
+    clip_norm: ScalarLike = 5.0,
     b1: float = 0.9,
     b2: float = 0.999,
     eps: float = 1e-8,
-    weight_decay: float = 0.0,
+    weight_decay: ScalarLike = 0.0,
 ) -> optax.GradientTransformation:
     """AdamW behind global-norm clipping; ``weight_decay`` spares vectors (biases, norm scales)."""
     return optax.chain(
@@ -121,37 +121,36 @@ def adamw(
     )
 
 
+OPTIMIZERS = {"ranger": ranger, "adamw": adamw}
+
+
 @dataclass(frozen=True)
 class Optimizer:
     """One interface to Ranger and AdamW: initialize, then update with the factor of the step.
+
+    A pytree of its numbers, which may be traced; bounds are checked where a configuration is read.
 
     Attributes:
       name: "ranger" or "adamw".
       learning_rate: base rate, multiplied by the schedule's factor.
       clip_norm: bound on the global norm of the gradient.
       weight_decay: decoupled weight decay.
-
-    Raises:
-      CaperError: unknown name, or a rate, bound or decay out of range.
     """
 
     name: OptimizerName = "ranger"
-    learning_rate: float = 1e-4
-    clip_norm: float = 5.0
-    weight_decay: float = 0.0
+    learning_rate: ScalarLike = 1e-4
+    clip_norm: ScalarLike = 5.0
+    weight_decay: ScalarLike = 0.0
 
-    def __post_init__(self) -> None:
+    @classmethod
+    def of(cls, config: TrainingConfig) -> Optimizer:
+        """The optimizer that a run's settings describe."""
+        return cls(config.optimizer, config.learning_rate, config.clip_norm, config.weight_decay)
+
+    def _transformation(self, factor: ScalarLike) -> optax.GradientTransformation:
         if self.name not in OPTIMIZERS:
             raise unknown_name("optimizer", self.name, OPTIMIZERS)
-        for field in ("learning_rate", "clip_norm"):
-            if not 0.0 < getattr(self, field) < math.inf:
-                raise CaperError(f"{field} must be positive, got {getattr(self, field)}")
-        if not 0.0 <= self.weight_decay < math.inf:
-            raise CaperError(f"weight_decay must not be negative, got {self.weight_decay}")
-
-    def _transformation(self, factor: jax.typing.ArrayLike) -> optax.GradientTransformation:
-        build = ranger if self.name == "ranger" else adamw
-        return build(
+        return OPTIMIZERS[self.name](
             self.learning_rate * factor, clip_norm=self.clip_norm, weight_decay=self.weight_decay
         )
 
@@ -160,6 +159,9 @@ class Optimizer:
 
         Args:
           params: the network's parameters.
+
+        Raises:
+          CaperError: unknown name.
 
         Returns:
           (params, optimizer_state); with Ranger the parameters are a ``LookaheadParams`` whose
@@ -170,7 +172,7 @@ class Optimizer:
         return params, self._transformation(1.0).init(params)
 
     def update(
-        self, gradients: PyTree, state: PyTree, params: PyTree, factor: jax.typing.ArrayLike
+        self, gradients: PyTree, state: PyTree, params: PyTree, factor: ScalarLike
     ) -> tuple[PyTree, PyTree]:
         """One step.
 
@@ -187,6 +189,13 @@ class Optimizer:
         return optax.apply_updates(params, updates), state
 
 
+jax.tree_util.register_dataclass(
+    Optimizer,
+    data_fields=["learning_rate", "clip_norm", "weight_decay"],
+    meta_fields=["name"],
+)
+
+
 def training_weights(params: PyTree) -> PyTree:
     """The weights at which the loss is differentiated (the fast ones under Lookahead)."""
     return params.fast if isinstance(params, optax.LookaheadParams) else params
@@ -195,8 +204,3 @@ def training_weights(params: PyTree) -> PyTree:
 def evaluation_weights(params: PyTree) -> PyTree:
     """The weights to evaluate and to export (the slow ones under Lookahead)."""
     return params.slow if isinstance(params, optax.LookaheadParams) else params
-
-
-def optimizer_of(config: TrainingConfig) -> Optimizer:
-    """The optimizer that a run's settings describe."""
-    return Optimizer(config.optimizer, config.learning_rate, config.clip_norm, config.weight_decay)

@@ -1,4 +1,4 @@
-"""The training state and the compiled step."""
+"""The training state, the step as a plain function, and the compiled step of the loop."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jaxtyping import Array, Float, Int, UInt
 
 from caper_jax.config import BatchNormExtent
-from caper_jax.training import parallel
-from caper_jax.training.optimizer import Optimizer, evaluation_weights, training_weights
+from caper_jax.training import memory, parallel
+from caper_jax.training.optimizer import (
+    Optimizer,
+    ScalarLike,
+    evaluation_weights,
+    training_weights,
+)
 
 PyTree = Any
 
@@ -22,7 +27,8 @@ LossFn = Callable[
     [PyTree, PyTree, PyTree, jax.Array, jax.Array],
     tuple[jax.Array, tuple[PyTree, dict[str, jax.Array]]],
 ]
-
+# (loss_fn, has_aux=True) -> function of the same arguments -> ((loss, aux), gradients)
+GradientTransform = Callable[..., Callable[..., Any]]
 
 _DATA_STREAM, _LOSS_STREAM = 0, 1
 
@@ -39,24 +45,28 @@ class TrainState:
       skipped: [] int32 steps left out because the loss or a gradient was not finite.
       seed: [] uint32 from which every random key of the run follows.
       elapsed: [] float32 seconds of training, summed over resumes.
+
+    A leading axis on all of them makes it a stack of states, as ``jax.vmap`` takes and gives it.
     """
 
-    step: jax.Array
+    step: Int[Array, "*batch"]
     params: PyTree
     model_state: PyTree
     opt_state: PyTree
-    skipped: jax.Array
-    seed: jax.Array
-    elapsed: jax.Array
+    skipped: Int[Array, "*batch"]
+    seed: UInt[Array, "*batch"]
+    elapsed: Float[Array, "*batch"]
 
     @classmethod
-    def create(cls, variables: dict[str, PyTree], optimizer: Optimizer, seed: int) -> TrainState:
+    def create(
+        cls, variables: dict[str, PyTree], optimizer: Optimizer, seed: ScalarLike = 0
+    ) -> TrainState:
         """The state before the first step.
 
         Args:
           variables: what the network's ``init`` returned: "params" and mutable collections.
           optimizer: the optimizer of the run.
-          seed: seed of the run, 0 <= seed < 2**32.
+          seed: [] seed of the run, 0 <= seed < 2**32; may be traced, e.g. under vmap.
         """
         # Copies: the step donates its buffers, and the caller's variables must survive it.
         variables = jax.tree.map(jnp.array, dict(variables))
@@ -67,7 +77,7 @@ class TrainState:
             model_state=variables,
             opt_state=opt_state,
             skipped=jnp.zeros((), jnp.int32),
-            seed=jnp.asarray(np.uint32(seed)),
+            seed=jnp.asarray(seed, jnp.uint32),
             elapsed=jnp.zeros((), jnp.float32),
         )
 
@@ -83,23 +93,75 @@ def step_keys(seed: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jax.random.fold_in(key, _DATA_STREAM), jax.random.fold_in(key, _LOSS_STREAM)
 
 
-def make_step(
+def train_step(
+    state: TrainState,
+    batch: PyTree,
+    progress: ScalarLike = 0.0,
+    factor: ScalarLike = 1.0,
+    *,
+    loss_fn: LossFn,
+    optimizer: Optimizer,
+    value_and_grad: GradientTransform = jax.value_and_grad,
+) -> tuple[TrainState, dict[str, jax.Array]]:
+    """One step on one batch: a pure function, to be jitted, vmapped, scanned or nested at will.
+
+    A step whose loss or gradient is not finite leaves weights, optimizer and model state as they
+    were, counts in ``skipped`` and reports ``applied`` = 0. Random numbers of the loss follow from
+    ``state.seed`` and ``state.step``.
+
+    Args:
+      state: the state; under vmap of several seeds, rates or loss weights a stack of states.
+      batch: what ``loss_fn`` takes.
+      progress: fraction of the run that is done, passed to ``loss_fn``.
+      factor: of the learning rate in this step, see ``optimizer.flat_and_anneal``.
+      loss_fn: ``(params, model_state, batch, key, progress) -> (loss, (new_model_state,
+        metrics))``, e.g. an ``Objective``; metrics are scalars by name.
+      optimizer: the optimizer; its numbers may be traced.
+      value_and_grad: ``memory.value_and_grad`` holds less memory at once.
+
+    Returns:
+      (new state, metrics), among them "loss", "gradient_norm" (before clipping) and "applied".
+
+    Example:
+      step = jax.jit(partial(train_step, loss_fn=objective, optimizer=optimizer))
+      state, metrics = step(state, batch)
+    """
+    _, key = step_keys(state.seed, state.step)
+    (loss, (model_state, metrics)), gradients = value_and_grad(loss_fn, has_aux=True)(
+        training_weights(state.params), state.model_state, batch, key, progress
+    )
+    norm = jnp.sqrt(sum(jnp.sum(jnp.square(g)) for g in jax.tree.leaves(gradients)))
+    # The norm is finite only if every gradient is; the model state may break on its own.
+    applied = jnp.isfinite(loss) & jnp.isfinite(norm) & _all_finite(model_state)
+    params, opt_state = optimizer.update(gradients, state.opt_state, state.params, factor)
+
+    def keep(new: PyTree, old: PyTree) -> PyTree:
+        return jax.tree.map(lambda n, o: jnp.where(applied, n, o), new, old)
+
+    new = dataclasses.replace(
+        state,
+        step=state.step + 1,
+        params=keep(params, state.params),
+        model_state=keep(model_state, state.model_state),
+        opt_state=keep(opt_state, state.opt_state),
+        skipped=state.skipped + jnp.where(applied, 0, 1),
+    )
+    return new, {**metrics, "loss": loss, "gradient_norm": norm, "applied": applied}
+
+
+def compile_step(
     loss_fn: LossFn,
     optimizer: Optimizer,
     *,
     batch_fn: Callable[..., PyTree] | None = None,
     mesh: jax.sharding.Mesh | None = None,
     batch_norm: BatchNormExtent = "global",
+    save_memory: bool = True,
 ) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
-    """Compile the training step.
-
-    Several steps may share one dispatch: ``progress`` and ``factor`` are [n] and the step is
-    scanned n times. A step whose loss or gradient is not finite leaves weights, optimizer and
-    model state as they were, counts in ``skipped`` and reports ``applied`` = 0.
+    """The loop's dispatch: one or several ``train_step`` compiled into one call.
 
     Args:
-      loss_fn: ``(params, model_state, batch, key, progress) -> (loss, (new_model_state,
-        metrics))``; metrics are scalars by name.
+      loss_fn: see ``train_step``.
       optimizer: the optimizer.
       batch_fn: ``(key) -> batch`` traced into the step, or ``(key, data) -> batch`` where the
         caller passes ``data``; every leaf leads with the batch axis. None: the caller passes a
@@ -107,49 +169,38 @@ def make_step(
       mesh: split the batch over this mesh's "data" axis; weights are replicated.
       batch_norm: "global": over a mesh too the step is that of the whole batch on one device.
         "local": losses, with the means in them, are those of each device's rows, averaged.
+      save_memory: gradients by ``memory.value_and_grad``.
 
     Returns:
-      ``run(state, progress, factor, data)``: the state is donated; ``data`` is the batch where
-      there is no ``batch_fn``, else what ``batch_fn`` takes besides the key (None for nothing).
-      Returns the new state and the metrics of each step: [n] arrays, among them "loss",
-      "gradient_norm" (before clipping) and "applied".
+      ``run(state, progress, factor, data)``: the state is donated; ``progress`` and ``factor`` are
+      [n], of n steps; ``data`` is the batch where there is no ``batch_fn``, else what ``batch_fn``
+      takes besides the key (None for nothing). Returns the new state and the metrics [n] of each
+      step.
     """
 
-    gradient = jax.value_and_grad(loss_fn, has_aux=True)
-    if mesh is not None and batch_norm == "local":
-        gradient = parallel.each_device(gradient, mesh)
+    def gradient(loss_fn: LossFn, has_aux: bool = True) -> Callable[..., Any]:
+        transform = memory.value_and_grad if save_memory else jax.value_and_grad
+        function = transform(loss_fn, has_aux=has_aux)
+        if mesh is None or batch_norm == "global":
+            return function
+        return parallel.each_device(function, mesh)
 
     def one(state: TrainState, progress: jax.Array, factor: jax.Array, data: PyTree):
-        data_key, loss_key = step_keys(state.seed, state.step)
-        if batch_fn is None:
-            batch = data
-        else:
-            batch = batch_fn(data_key) if data is None else batch_fn(data_key, data)
+        batch = data
+        if batch_fn is not None:
+            key, _ = step_keys(state.seed, state.step)
+            batch = batch_fn(key) if data is None else batch_fn(key, data)
         if mesh is not None:
             batch = parallel.constrain_batch(batch, mesh)
-
-        weights = training_weights(state.params)
-        (loss, (model_state, metrics)), gradients = gradient(
-            weights, state.model_state, batch, loss_key, progress
-        )
-        norm = jnp.sqrt(sum(jnp.sum(jnp.square(g)) for g in jax.tree.leaves(gradients)))
-        # The norm is finite only if every gradient is; the model state may break on its own.
-        applied = jnp.isfinite(loss) & jnp.isfinite(norm) & _all_finite(model_state)
-
-        params, opt_state = optimizer.update(gradients, state.opt_state, state.params, factor)
-
-        def keep(new: PyTree, old: PyTree) -> PyTree:
-            return jax.tree.map(lambda n, o: jnp.where(applied, n, o), new, old)
-
-        new = dataclasses.replace(
+        return train_step(
             state,
-            step=state.step + 1,
-            params=keep(params, state.params),
-            model_state=keep(model_state, state.model_state),
-            opt_state=keep(opt_state, state.opt_state),
-            skipped=state.skipped + jnp.where(applied, 0, 1),
+            batch,
+            progress,
+            factor,
+            loss_fn=loss_fn,
+            optimizer=optimizer,
+            value_and_grad=gradient,
         )
-        return new, {**metrics, "loss": loss, "gradient_norm": norm, "applied": applied}
 
     def run(state: TrainState, progress: jax.Array, factor: jax.Array, data: PyTree = None):
         if progress.shape[0] == 1:  # no loop: XLA for CPU runs less of a loop's body in parallel
@@ -158,18 +209,13 @@ def make_step(
         return jax.lax.scan(lambda s, x: one(s, x[0], x[1], data), state, (progress, factor))
 
     device = jax.local_devices()[0] if mesh is None else mesh.devices.flat[0]
-    options = _compiler_options(device.platform)
-    if mesh is None:
-        return jax.jit(run, donate_argnums=0, compiler_options=options)
-    everywhere = parallel.replicated(mesh)
-    given = everywhere if batch_fn is not None else parallel.batch_sharding(mesh)
-    return jax.jit(
-        run,
-        donate_argnums=0,
-        compiler_options=options,
-        in_shardings=(everywhere, everywhere, everywhere, given),
-        out_shardings=everywhere,
-    )
+    options: dict[str, Any] = {"compiler_options": _compiler_options(device.platform)}
+    if mesh is not None:
+        everywhere = parallel.replicated(mesh)
+        given = everywhere if batch_fn is not None else parallel.batch_sharding(mesh)
+        options["in_shardings"] = (everywhere, everywhere, everywhere, given)
+        options["out_shardings"] = everywhere
+    return jax.jit(run, donate_argnums=0, **options)
 
 
 _LEAST_MEMORY = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}

@@ -7,7 +7,7 @@ import math
 import platform
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from caper_jax._version import __version__
 from caper_jax.articulation.category import Category
 from caper_jax.config import (
     PRESETS,
-    LoaderConfig,
     RefinerConfig,
     RunConfig,
     preset,
@@ -47,8 +46,7 @@ from caper_jax.training import fit_refiner, parallel
 from caper_jax.training.fit_uncertainty import calibrate
 from caper_jax.training.loop import FitResult, fit
 from caper_jax.training.objective import Objective
-from caper_jax.training.run_directory import FILE as CONFIG_FILE
-from caper_jax.training.run_directory import STARTED_FROM
+from caper_jax.training.run_directory import CONFIG_FILE, STARTED_FROM
 
 _SAMPLE = 512  # frames that give the trivial predictor of the model card
 
@@ -67,7 +65,12 @@ def preset_of(directory: str | Path, category: str) -> RunConfig:
     )
 
 
-def train(config: RunConfig, directory: str | Path, initial: str | Path | None = None) -> FitResult:
+def train(
+    config: RunConfig,
+    directory: str | Path,
+    initial: str | Path | None = None,
+    category: Category | None = None,
+) -> FitResult:
     """Trains, validates and writes a model directory; resumes when the directory holds the run.
 
     Args:
@@ -76,50 +79,76 @@ def train(config: RunConfig, directory: str | Path, initial: str | Path | None =
         weights.npz and model.json. The model of a run that had ended before stays as it is.
       initial: model directory whose weights the run starts from (its card is kept in the new
         one); by default the weights are random. A model of another category gives its encoders.
+      category: the category itself, where it is not registered; files keep its name, and its
+        model loads by ``load(category, directory)``.
 
     Raises:
-      CaperError: see ``training.loop.fit``; a ``init_weight_average`` of no model of this category.
+      CaperError: see ``training.loop.fit``; an ``init_weight_average`` of no model of this
+        category.
+
+    Example:
+      config = preset("fast", "box")
+      train(replace(config, training=replace(config.training, minutes=30.0)), "runs/box")
     """
-    category = categories.get(config.category)
+    given = config.category if category is None else category
+    category = categories.get(config.category) if category is None else category
     config = replace(config, category=category.name)  # FILE.py:NAME may be spelled in many ways
-    task = Objective(category, config.network, config.loss)
-    description = to_dict(config)
-    description.pop("training")
-    variables = task.init(jax.random.key(config.training.seed))
-    stored: dict[str, Any] = {}
-    started_from, same = None, False
-    if initial is not None:
-        started_from, stored = read_model(initial)
-        same = started_from.get("category") == category.name
-        variables = initial_variables(variables, stored, initial, same)
-        description[STARTED_FROM] = started_from
-    if config.init_weight_average and not same:
-        raise CaperError(
-            f"init_weight_average = {config.init_weight_average} needs a model of "
-            f"{category.name!r} to start from"
-        )
-    mesh = _mesh(config.training.batch_size)
-    fit_task = partial(
-        fit, directory, config.training, task.loss, variables, mesh=mesh, description=description
+    objective = Objective(category, config.network, config.loss)
+    start = _start(objective, config, initial)
+    description = {name: part for name, part in to_dict(config).items() if name != "training"}
+    if start.card is not None:
+        description[STARTED_FROM] = start.card
+    run = partial(
+        fit,
+        directory,
+        config.training,
+        objective,
+        start.variables,
+        mesh=_mesh(config.training.batch_size),
+        description=description,
     )
     if config.loader is None:
-        result, draw_sample = _fit_generated(fit_task, config, category)
+        result, draw_sample = _fit_generated(run, config, category)
     else:
-        result, draw_sample = _fit_dataset(fit_task, config, config.loader)
+        result, draw_sample = _fit_dataset(run, config, given)
     if result.finished and jax.process_index() == 0 and not _complete(directory, result):
         card = _card(config, result, draw_sample())
-        if started_from is not None:
-            card |= _with_origin(card, started_from)
+        if start.card is not None:
+            card |= _with_origin(card, start.card)
         trained = jax.device_get(result.state.variables)
         if config.init_weight_average:
-            trained = averaged(stored, trained, config.init_weight_average)
+            trained = averaged(start.weights, trained, config.init_weight_average)
         write_model(directory, trained, card)
         if config.loader is None:  # of the weights as they are stored, and once they are
-            _finish(config, directory)
+            _finish(config, given, directory)
         write_card(directory, {**read_card(directory), "complete": _digest(directory)})
     # The others wait: one that ends takes the run with it after some minutes.
     parallel.agree([0.0])
     return result
+
+
+@dataclass(frozen=True)
+class _Start:
+    """What a run starts from: its variables; the card and the weights of another model, if any."""
+
+    variables: Any
+    card: dict[str, Any] | None = None
+    weights: Any = None
+
+
+def _start(objective: Objective, config: RunConfig, initial: str | Path | None) -> _Start:
+    variables = objective.init(jax.random.key(config.training.seed))
+    start, same = _Start(variables), False
+    if initial is not None:
+        card, weights = read_model(initial)
+        same = card.get("category") == config.category
+        start = _Start(initial_variables(variables, weights, initial, same), card, weights)
+    if config.init_weight_average and not same:
+        raise CaperError(
+            f"init_weight_average = {config.init_weight_average} needs a model of "
+            f"{config.category!r} to start from"
+        )
+    return start
 
 
 def _complete(directory: str | Path, result: FitResult) -> bool:
@@ -136,23 +165,24 @@ def _digest(directory: str | Path) -> str:
     return hashlib.sha256((Path(directory) / CONFIG_FILE).read_bytes()).hexdigest()[:16]
 
 
-def _finish(config: RunConfig, directory: str | Path) -> None:
-    """Adds to a model what is fitted on its own estimates: sides, then how wrong it is."""
+def _finish(config: RunConfig, category: str | Category, directory: str | Path) -> None:
+    """Adds to a model what is fitted on its own estimates: the refiner, then its uncertainty."""
     seed = config.training.seed
-    if config.network.refiner.width:
-        arguments = (config.network.refiner.width, config.network.refiner.frames, seed)
+    refiner = config.network.refiner
+    if refiner.width:
+        arguments = (config.data, refiner.width, refiner.frames, seed)
         try:
-            fit_refiner.add_sides(directory, config.category, config.data, *arguments)
-        except fit_refiner.TurnedModel as error:  # a short run: the model is usable as it is
-            print(f"sides are not fitted: {error}", file=sys.stderr)
+            fit_refiner.add_refiner(directory, category, *arguments)
+        except fit_refiner.UnreliableModel as error:  # a short run: usable as it is
+            print(f"the refiner is not fitted: {error}", file=sys.stderr)
     if config.calibration_frames:
-        estimator = load(config.category, directory)
+        estimator = load(category, directory)
         calibration = calibrate(estimator, config.data, config.calibration_frames, seed)
         write_card(directory, {**estimator.card, "calibration": calibration})
 
 
 def _fit_generated(
-    fit_task: Callable[..., FitResult], config: RunConfig, category: Category
+    run: Callable[..., FitResult], config: RunConfig, category: Category
 ) -> tuple[FitResult, Callable[[], Batch]]:
     """Trains on endless generated frames; also a function that draws some of them."""
     generator = Generator(category, config.data, split="train", seed=config.training.seed)
@@ -161,18 +191,21 @@ def _fit_generated(
     def batch_fn(key, bank):
         return generator.draw(key, batch_size, bank)
 
-    result = fit_task(batch_fn=batch_fn, data=generator.bank)
+    result = run(batch_fn=batch_fn, data=generator.bank)
     return result, lambda: generator.batch(jax.random.key(config.training.seed), _SAMPLE)
 
 
 def _fit_dataset(
-    fit_task: Callable[..., FitResult], config: RunConfig, source: LoaderConfig
+    run: Callable[..., FitResult], config: RunConfig, category: str | Category
 ) -> tuple[FitResult, Callable[[], Batch]]:
     """Trains on a dataset; also a function that reads some of its frames."""
+    source = config.loader
+    assert source is not None
+    known: Any = category  # a name or the object itself, as ``categories.get`` takes both
     dataset = open_dataset(
         source.format,
         source.root,
-        config.category,
+        known,
         source.split,
         num_points=4 * config.network.num_points,  # every epoch picks others of them
     )
@@ -185,7 +218,7 @@ def _fit_dataset(
         prefetch=source.prefetch,
         cache_gib=source.cache_gib,
     ) as loader:
-        result = fit_task(batches=loader)
+        result = run(batches=loader)
 
     def draw_sample() -> Batch:
         size = min(_SAMPLE, len(dataset))
@@ -210,23 +243,24 @@ def initial_variables(
 
     A model of another category gives its encoders only: outputs of its heads would begin with that
     category's conventions, and from an axis that points the other way no gradient leads back. A
-    model without a turn head gets a new one. What was fitted on its estimates is left behind.
+    model without a rotation classifier gets a new one. What was fitted on its estimates is left
+    behind.
     """
-    wanted, found = flatten(template), flatten(stored)
-    found = {name: leaf for name, leaf in found.items() if not name.startswith("params/refiner/")}
-    new = {name for name in wanted if "/turn/" in name} - found.keys()
+    wanted, given = flatten(template), flatten(stored)
+    given = {name: leaf for name, leaf in given.items() if not name.startswith("params/refiner/")}
+    new = {name for name in wanted if "/turn/" in name} - given.keys()
     taken = [n for n in wanted if (same_category and n not in new) or "/encoder/" in n]
-    fits = all(name in found and np.shape(found[name]) == np.shape(wanted[name]) for name in taken)
-    if not fits or (same_category and found.keys() != wanted.keys() - new):
+    fits = all(name in given and np.shape(given[name]) == np.shape(wanted[name]) for name in taken)
+    if not fits or (same_category and given.keys() != wanted.keys() - new):
         raise CaperError(
             f"{directory}: its weights are of another network than this run's; leave out the "
             "preset and the network settings, and the run has its"
         )
-    return unflatten(wanted | {name: jnp.asarray(found[name], jnp.float32) for name in taken})
+    return unflatten(wanted | {name: jnp.asarray(given[name], jnp.float32) for name in taken})
 
 
 def averaged(start: Any, trained: Any, share: float) -> Any:
-    """Weights of which ``share`` is what a run started from; what is new in it is as trained."""
+    """Weights of which ``share`` is what a run started from; those that are new stay as trained."""
     known, mixed = flatten(start), flatten(trained)
     for name in mixed.keys() & known.keys():
         mixed[name] = share * known[name].astype(np.float32) + (1 - share) * mixed[name]

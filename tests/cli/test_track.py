@@ -16,7 +16,6 @@ from _helpers.arm import ARM, arm_pose
 from _helpers.depth_videos import write_video
 from _helpers.frames import random_frames, random_pose
 from _helpers.quick import quick_jit
-from caper_jax.evaluation.tracking import format_tracks
 from PIL import Image
 
 from caper_jax import categories, cli
@@ -26,7 +25,7 @@ from caper_jax.data import hdf5
 from caper_jax.data.live import pack_frame, read_frames
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator
-from caper_jax.evaluation.tracking import Track
+from caper_jax.evaluation.tracking import Track, format_tracks
 from caper_jax.tracker import Tracker
 from caper_jax.tracking.step import TrackResult
 from caper_jax.visualization.track import evenly_spaced, write_states

@@ -139,9 +139,9 @@ def test_fitting_writes_a_model_that_knows_sizes_better(tmp_path, monkeypatch):
     folder = tmp_path / "box"
     shutil.copytree(shipped_weights() / "box", folder)
     data = GeneratorConfig(instances=200, grid=48, num_points=1024, noise=("none",))
-    fitting.add_sides(folder, "box", data, 64, 4096)
+    fitting.add_refiner(folder, "box", data, 64, 4096)
     card, variables = read_model(folder)
-    assert card["run"]["network"]["sides_width"] == 64 and "calibration" not in card
+    assert card["run"]["network"]["refiner"]["width"] == 64 and "calibration" not in card
     assert variables["params"]["refiner"]["Dense_0"]["kernel"].shape[1] == 64
     fitted, batch = load("box", folder), frames(BOX)
     assert errors(fitted, batch)[1] < 0.95 * errors(without(fitted), batch)[1]
@@ -149,12 +149,12 @@ def test_fitting_writes_a_model_that_knows_sizes_better(tmp_path, monkeypatch):
 
 def test_too_few_frames_are_refused():
     with pytest.raises(CaperError, match="needs 1024 frames or more, got 100"):
-        fitting.fit_sides(load("box"), GeneratorConfig(), 64, 100)
+        fitting.fit_refiner(load("box"), GeneratorConfig(), 64, 100)
 
 
 def test_a_model_that_is_always_turned_is_refused(monkeypatch):
-    monkeypatch.setattr(fitting, "_TURNED", 1e-6)
+    monkeypatch.setattr(fitting, "_MAX_ROTATION", 1e-6)
     monkeypatch.setattr(fitting, "_BATCH", 64)
     data = GeneratorConfig(instances=64, grid=48, num_points=1024, noise=("none",))
-    with pytest.raises(fitting.TurnedModel, match="train the model longer"):
-        fitting.fit_sides(load("box"), data, 64, 128)
+    with pytest.raises(fitting.UnreliableModel, match="train the model longer"):
+        fitting.fit_refiner(load("box"), data, 64, 128)

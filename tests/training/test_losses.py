@@ -17,12 +17,12 @@ Z = [0.0, 0.0, 1.0]
 
 
 def normal(*shape, seed=0):
-    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
 
 
 def units(*shape, seed=0):
     vectors = normal(*shape, 3, seed=seed)
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def array(values):
@@ -166,7 +166,7 @@ def test_direction_and_scale_are_mean_absolute_differences():
 
 def test_segmentation_is_cross_entropy_without_unlabeled_points():
     logits = normal(2, 5, 3)
-    labels = np.array([[0, 1, 2, -1, -1], [2, 2, -1, 0, 1]])
+    labels = jnp.array([[0, 1, 2, -1, -1], [2, 2, -1, 0, 1]])
     odds = np.exp(logits)
     probability = odds / odds.sum(-1, keepdims=True)
     expected = [
@@ -174,7 +174,7 @@ def test_segmentation_is_cross_entropy_without_unlabeled_points():
         for b in range(2)
     ]
     np.testing.assert_allclose(losses.segmentation_loss(logits, labels), expected, rtol=1e-5)
-    assert (losses.segmentation_loss(logits, np.full((2, 5), -1)) == 0).all()
+    assert (losses.segmentation_loss(logits, jnp.full((2, 5), -1)) == 0).all()
 
 
 def test_twist_adds_the_mean_of_each_half():
@@ -206,10 +206,10 @@ def test_weights_of_the_paper():
 def exact_cases():
     """Every loss at the truth: (function of the prediction, the right prediction)."""
     directions, joints, points = units(2, 2), units(2, 3, seed=1), normal(2, 9, 3, seed=2)
-    pivot, state = normal(2, 3, 3, seed=3), np.abs(normal(2, 3, seed=4))
-    offsets = np.array(losses.axis_offsets(*map(array, (points, joints, pivot))))
+    pivot, state = normal(2, 3, 3, seed=3), jnp.abs(normal(2, 3, seed=4))
+    offsets = losses.axis_offsets(points, joints, pivot)
     heatmap = losses.heatmap_target(jnp.linalg.norm(offsets, axis=-1))
-    certain = np.ones((2, 2), np.float32)
+    certain = jnp.ones((2, 2))
     return {
         "rotation": (lambda x: losses.rotation_loss(x, directions), directions),
         "translation": (lambda x: losses.translation_loss(x, pivot[:, 0]), pivot[:, 0]),
@@ -230,7 +230,7 @@ def exact_cases():
 
 def test_the_truth_costs_nothing_and_has_finite_gradients():
     cases = exact_cases()
-    labels = np.array([[0, 1, -1]])
+    labels = jnp.array([[0, 1, -1]])
     logits = 1e4 * np.eye(2, dtype=np.float32)[labels]
     cases["segmentation"] = (lambda x: losses.segmentation_loss(x, labels), logits)
 

@@ -1,4 +1,4 @@
-"""Training both stages: targets, readings of ambiguous objects, noise of the root, gradients."""
+"""The objective: targets, symmetries, reference poses, rotation classes, gradients."""
 
 from __future__ import annotations
 
@@ -13,29 +13,31 @@ from _helpers.tiny import network, random_variables
 from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.symmetry import apply_symmetry
-from caper_jax.config import LossConfig, LossWeights
+from caper_jax.config import LossConfig, LossWeights, RotationClassifierConfig
 from caper_jax.geometry.frames import view_rotation
-from caper_jax.lie import se3
+from caper_jax.lie import se3, so3
 from caper_jax.models.parts import PartsOutput
 from caper_jax.models.root import RootOutput
-from caper_jax.training.objective import Objective
+from caper_jax.models.rotation_classes import CUBE_ROTATIONS, HALF_TURNS
+from caper_jax.training import memory
+from caper_jax.training.objective import Objective, rotate_references, stage1_loss, stage2_loss
 
 # A door on a cabinet, and a drawer that slides in it.
 NO_ERROR = Rotation.identity()
 
 
 class Oracle(Objective):
-    """A task whose networks answer what they are told to, in place of weights.
+    """An objective whose networks answer what they are told to, in place of weights.
 
     ``params`` of either stage is (pose [B, ...], labels [B, N], view [B, 3, 3], error [3, 3] of the
     root in the viewing frame); the points that each stage is given come back as its state. Stage
     II's increment is that from the reference its points were canonicalized with (Eq 10).
     """
 
-    def _noisy_root(self, key, output, truth):
-        found = super()._noisy_root(key, output, truth)
-        self._reference, _ = found
-        return found
+    def _reference_pose(self, *arguments):
+        drawn = super()._reference_pose(*arguments)
+        self._reference, _ = drawn
+        return drawn
 
     def _increment(self, rotation, translation):
         """Twists [B, 6] from the reference to a root pose in the viewing frame."""
@@ -84,7 +86,7 @@ class Oracle(Objective):
     def play(self, batch, pose, labels, error=NO_ERROR):
         """(total loss, points that stage II is given, metrics) when the networks answer so."""
         if not hasattr(self, "_jitted"):
-            self._jitted = jax.jit(lambda params, batch: self.loss(params, *self._rest(batch)))
+            self._jitted = jax.jit(lambda params, batch: self(params, *self._rest(batch)))
         view = view_rotation(batch.points, self.category.viewpoint.camera_roll)
         params = (pose, jnp.asarray(labels), view, jnp.asarray(error.as_matrix(), jnp.float32))
         total, (state, metrics) = self._jitted({"root": params, "parts": params}, batch)
@@ -110,13 +112,13 @@ def canonical_points(batch, pose, unit):
     return unit * np.einsum("bji,bnj->bni", pose.rotation[:, 0], offset)
 
 
-@pytest.mark.parametrize("task", [BOXES, CABINETS], ids=["box", "cabinet"])
-def test_the_truth_costs_nothing(task):
+@pytest.mark.parametrize("objective", [BOXES, CABINETS], ids=["box", "cabinet"])
+def test_the_truth_costs_nothing(objective):
     """In particular: every target is in the unit, frame and order in which it is predicted."""
-    sizes = [THIN, DEEP, THIN] if task is BOXES else [CABINET.mean_size] * 2
-    batch = frames(task.category, sizes)
-    total, seen, metrics = task.play(batch, batch.pose, batch.labels)
-    if task is BOXES:
+    sizes = [THIN, DEEP, THIN] if objective is BOXES else [CABINET.mean_size] * 2
+    batch = frames(objective.category, sizes)
+    total, seen, metrics = objective.play(batch, batch.pose, batch.labels)
+    if objective is BOXES:
         expected = canonical_points(batch, batch.pose, BOX.unit)
         np.testing.assert_allclose(seen, expected, atol=1e-5)
     assert metrics.pop("segmentation_accuracy") == pytest.approx(1.0)
@@ -158,7 +160,7 @@ def test_the_total_weighs_each_loss_as_the_paper_does():
     weights = dataclasses.asdict(CABINETS.config.weights)
     total, _, metrics = CABINETS.play(batch, pose, 2 - jnp.maximum(batch.labels, 0))
     named = {name: metrics[name] for name in weights if name in metrics}
-    assert set(weights) - {"turn"} == set(named)  # there is no turn head
+    assert set(weights) - {"rotation_class"} == set(named)  # there is no rotation classifier
     assert min(named.values()) > 1e-3
     expected = sum(weights[name] * value for name, value in named.items())
     np.testing.assert_allclose(total, expected, rtol=1e-5)
@@ -172,20 +174,20 @@ def test_the_total_weighs_each_loss_as_the_paper_does():
     np.testing.assert_allclose(metrics["state"], (off[0] + 4 * off[1]) / 2, rtol=1e-4)
 
 
-def test_ambiguous_objects_are_scored_under_the_reading_they_are_predicted_in():
+def test_ambiguous_objects_are_scored_under_the_symmetry_they_are_predicted_in():
     batch = frames(BOX, [THIN, DEEP, THIN])
     (symmetry,) = BOX.symmetries
     second = apply_symmetry(batch.pose, symmetry, BOX)
     labels = np.asarray(batch.labels)
     exchanged = np.where(labels < 0, -1, 1 - labels)
-    # Labels follow the reading, sample by sample.
+    # Labels follow the symmetry, sample by sample.
     mixed = np.where(np.array([[1], [0], [1]], bool), exchanged, labels)
     _, seen, metrics = BOXES.play(batch, second, mixed)
     one, other = (canonical_points(batch, pose, BOX.unit) for pose in (batch.pose, second))
     np.testing.assert_allclose(seen[[0, 2]], other[[0, 2]], atol=1e-5)
     assert metrics["segmentation_accuracy"] == pytest.approx(1.0)
     assert metrics["segmentation"] < 1e-5
-    # A deep box has one reading: the other is a mistake, and costs what it costs.
+    # A deep box has none: the other pose is a mistake, and costs what it costs.
     np.testing.assert_allclose(seen[1], one[1], atol=1e-5)
     assert metrics["root_deg"] == pytest.approx(180.0 / 3, abs=0.1)
     expected = per_sample_rotation(batch, second)[1] / 3
@@ -200,7 +202,7 @@ def per_sample_rotation(batch, predicted):
 
 
 def aligned(points, reference):
-    """Rotation vectors [B, 3] and shifts that take reference to points, and the box_residual."""
+    """Rotation vectors [B, 3] and shifts that take reference to points, and the largest rest."""
     means = points.mean(1, keepdims=True), reference.mean(1, keepdims=True)
     cross = np.einsum("bni,bnj->bij", points - means[0], reference - means[1])
     u, _, v = np.linalg.svd(cross)
@@ -216,15 +218,15 @@ def test_stage_two_sees_noisy_roots_and_predicted_ones_that_are_nearly_right():
     config = LossConfig(
         root_noise_deg=4.0, root_noise=0.05, root_noise_spread=1.0, predicted_root=0.5
     )
-    task = Oracle(BOX, network(), config)
+    oracle = Oracle(BOX, network(), config)
     truth = canonical_points(batch, batch.pose, BOX.unit)
 
     def seen(degrees):
         """Errors of the roots, in degrees and network units, when stage I is ``degrees`` off."""
         error = Rotation.from_rotvec([0, 0, np.radians(degrees)])
-        points = task.play(batch, batch.pose, batch.labels, error)[1]
-        turn, shift, box_residual = aligned(points, truth)
-        assert box_residual < 1e-4  # whatever the root, a rigid motion
+        points = oracle.play(batch, batch.pose, batch.labels, error)[1]
+        turn, shift, rest = aligned(points, truth)
+        assert rest < 1e-4  # whatever the root, a rigid motion
         return np.degrees(turn), shift
 
     # Too far off: none of the predictions is used.
@@ -246,9 +248,9 @@ def test_the_noise_of_the_roots_is_small_and_large():
     count, spread = 4000, 4.0
     config = LossConfig(root_noise=0.05, root_noise_spread=spread, predicted_root=0.0)
     pose = jax.tree.map(lambda leaf: jnp.repeat(leaf[:1], count, 0), frames(BOX, [DEEP]).pose)
-    directions = jnp.broadcast_to(jnp.eye(3)[:2], (count, 2, 3))
-    output = RootOutput(directions, jnp.ones((count, 2)), jnp.zeros((count, 3)))
-    reference, _ = Objective(BOX, network(), config)._noisy_root(jax.random.key(0), output, pose)
+    prediction = pose.rotation[:, 0], jnp.zeros((count, 3))
+    objective = Objective(BOX, network(), config)
+    reference, _ = objective._reference_pose(jax.random.key(0), *prediction, pose)
     shift = np.asarray(reference[:, :3, 3] - pose.translation[:, 0])
     # The mean square of a factor exp(U(-log 4, log 4)).
     square = (spread**2 - spread**-2) / (4 * np.log(spread))
@@ -263,18 +265,14 @@ def trained(request):
     batch = frames(BOX, [THIN, DEEP, THIN, DEEP])
     batch = batch.replace(points=batch.points.at[3].set(jnp.asarray([0.1, 0.0, 0.8])))
     # Heads of either kind, each with one encoder.
-    task = Objective(
-        BOX, network(request.param, request.param == "hs", point_stride=2), LossConfig()
-    )
-    variables = random_variables(BOX, task.network)
+    objective = Objective(BOX, network(request.param, request.param == "hs", point_stride=2))
+    variables = random_variables(BOX, objective.network)
     params, state = variables["params"], {"batch_stats": variables["batch_stats"]}
 
     @jax.jit
     def differentiate(params):
-        def loss(params):
-            return task.loss(params, state, batch, jax.random.key(1), 0.0)
-
-        return jax.value_and_grad(loss, has_aux=True)(params)
+        gradient = memory.value_and_grad(objective)
+        return gradient(params, state, batch, jax.random.key(1), 0.0)
 
     values, first = [], None
     for _ in range(80):
@@ -308,7 +306,112 @@ def test_training_on_one_batch_lowers_the_loss(trained):
 
 
 def test_init_has_both_stages():
-    task = Objective(BOX, network(), LossConfig())
-    shapes = jax.eval_shape(task.init, jax.random.key(0))
+    shapes = jax.eval_shape(Objective(BOX, network()).init, jax.random.key(0))
     assert set(shapes) == {"params", "batch_stats"}
     assert all(set(collection) == {"root", "parts"} for collection in shapes.values())
+
+
+# References that are off by a cube rotation
+
+CLASSIFIER = network(pool_first=True, rotation_classifier=RotationClassifierConfig(8))
+
+
+def truth_of(objective, batch):
+    """The truth in the networks' frame, when the camera looks along it."""
+    return objective._truth(batch.pose, jnp.broadcast_to(jnp.eye(3), (len(batch.points), 3, 3)))
+
+
+def test_references_are_rotated_on_purpose_and_say_so():
+    config = LossConfig(root_noise_deg=1.0, predicted_root=0.0)
+    objective = Objective(BOX, CLASSIFIER, config)
+    truth = truth_of(objective, frames(BOX, [DEEP] * 200))
+    key, prediction = jax.random.key(0), (truth.rotation[:, 0], truth.translation[:, 0])
+    reference, off_by = objective._reference_pose(key, *prediction, truth)
+    assert not np.asarray(off_by).any()
+    reference, off_by = rotate_references(key, reference, off_by, 0.4)
+    off_by = np.asarray(off_by)
+    assert 0.3 < (off_by > 0).mean() < 0.5
+    assert 0.4 < np.isin(off_by[off_by > 0], HALF_TURNS).mean() < 0.8
+    corrected = np.asarray(reference)[:, :3, :3] @ CUBE_ROTATIONS[off_by]
+    off = so3.geodesic_distance(jnp.asarray(corrected), truth.rotation[:, 0])
+    assert np.degrees(off).max() < 30  # the noise alone
+
+
+def test_predictions_that_are_off_by_a_half_turn_are_references_with_their_class():
+    objective = Objective(BOX, CLASSIFIER, LossConfig(predicted_root=1.0))
+    truth = truth_of(objective, frames(BOX, [DEEP] * 100))
+    half = np.diag([-1.0, 1.0, -1.0]).astype(np.float32)  # about y
+    prediction = truth.rotation[:, 0] @ half, truth.translation[:, 0]
+    reference, off_by = objective._reference_pose(jax.random.key(0), *prediction, truth)
+    np.testing.assert_array_equal(CUBE_ROTATIONS[np.asarray(off_by)], np.tile(half, (100, 1, 1)))
+    np.testing.assert_allclose(reference[:, :3, :3], prediction[0], atol=1e-6)
+
+
+def outputs_and_targets(objective, batch, off_by):
+    """Stage II's truth, as output and as target; its outputs are off by a little."""
+    truth = truth_of(objective, batch)
+    root = se3.from_rt(truth.rotation[:, 0], truth.translation[:, 0])
+    targets = objective._parts_targets(batch.points, batch.labels, truth, root)
+    count, parts = len(batch.points), objective.category.num_parts
+    outputs = PartsOutput(
+        increment=targets.increment + 0.1,
+        rotation_class=jnp.zeros((count, 24)) if off_by is not None else None,
+        segmentation=jnp.zeros((*batch.labels.shape, parts)),
+        heatmap=jnp.ones((*batch.labels.shape, parts - 1)),
+        offset=truth.joint_pivot[:, None] - batch.points[:, :, None],
+        direction=jnp.broadcast_to(-truth.joint_axis[:, None], (*batch.labels.shape, parts - 1, 3)),
+        state=truth.joint_state + 0.5,
+        size=truth.size + 0.1,
+        center=truth.box_center,
+    )
+    if off_by is not None:
+        targets = targets.replace(rotation_class=jnp.asarray(off_by))
+    return outputs, targets
+
+
+def test_of_rotated_references_only_the_rotation_and_the_increment_are_learned():
+    """And what is logged of everything else is of the other samples."""
+    objective = Objective(CABINET, CLASSIFIER)
+    batch = frames(CABINET, np.array([CABINET.mean_size] * 3))
+    outputs, targets = outputs_and_targets(objective, batch, [0, 7, 0])
+    terms = stage2_loss(outputs, targets, objective.config)
+    weights = dataclasses.asdict(objective.config.weights)
+    for name, value in terms.items():
+        alone = name in ("rotation_class", "twist", "total")
+        assert (value[1] > 0) == alone and value[0] >= 0, name
+    expected = sum(weights[name] * terms[name] for name in terms.keys() - {"total"})
+    np.testing.assert_allclose(terms["total"], expected, rtol=1e-6)
+    metrics = objective._parts_metrics(outputs, targets, terms)
+    np.testing.assert_allclose(metrics["state1_deg"], np.degrees(0.5), rtol=1e-5)
+    np.testing.assert_allclose(metrics["scale"], 0.1, rtol=1e-5)
+    nothing = targets.replace(rotation_class=jnp.full(3, 7))
+    terms = stage2_loss(outputs, nothing, objective.config)
+    metrics = objective._parts_metrics(outputs, nothing, terms)
+    assert metrics["state"] == metrics["state1_deg"] == 0
+
+
+def test_joints_without_votes_find_back_from_the_opposite_axis():
+    """The loss of a unit vector has no slope there."""
+    objective = Objective(BOX, network(pool_first=True, joints="direct"))
+    batch = frames(BOX, [DEEP, DEEP])
+    outputs, targets = outputs_and_targets(objective, batch, None)
+
+    def loss(direction):
+        terms = stage2_loss(outputs.replace(direction=direction), targets, objective.config)
+        assert "heatmap" not in terms and "offset" not in terms
+        return terms["direction"].sum()
+
+    slope = jax.grad(loss)(outputs.direction).sum(1)
+    assert (np.asarray((slope * targets.joint_axis).sum(-1)) < -0.1).all()
+
+
+@pytest.mark.parametrize("change", [{"rotation": "quaternion"}, {"vertical_correction": False}])
+def test_ablations_of_stage_one_learn_no_confidence(change):
+    objective = Objective(BOX, network(**change))
+    targets = objective._root_targets(truth_of(objective, frames(BOX, [THIN, THIN])))
+    outputs = RootOutput(targets.directions, jnp.ones((2, 2)), targets.translation)
+    assert set(stage1_loss(outputs, targets, objective.config)) == {
+        "rotation",
+        "translation",
+        "total",
+    }
