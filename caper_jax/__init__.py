@@ -33,12 +33,16 @@ if TYPE_CHECKING:
         TrainingConfig,
         preset,
     )
-    from caper_jax.data.clouds import cloud_from_depth, read_points
+    from caper_jax.data.clouds import cloud_from_depth, mask_from_box, read_points, sample_points
     from caper_jax.data.images import read_depth, read_intrinsics, read_mask
     from caper_jax.data.readers import open_dataset
+    from caper_jax.data.readers import register as register_reader
+    from caper_jax.data.readers.base import DatasetReader
+    from caper_jax.data.types import Batch, Frame
     from caper_jax.errors import CaperError
     from caper_jax.estimator import Estimator, Prediction, estimate, load
     from caper_jax.evaluation.metrics import pose_errors
+    from caper_jax.evaluation.protocol import evaluate
     from caper_jax.export import export_estimator
     from caper_jax.lie import se3, so3
     from caper_jax.models import encoders
@@ -47,16 +51,21 @@ if TYPE_CHECKING:
     from caper_jax.tracker import Tracker, load_tracker
     from caper_jax.tracking.state import Observation, TrackerState
     from caper_jax.tracking.step import TrackResult, track_step
-    from caper_jax.training.step import TrainState
+    from caper_jax.training.objective import Objective
+    from caper_jax.training.optimizer import Optimizer
+    from caper_jax.training.step import TrainState, train_step
     from caper_jax.training.train import train
     from caper_jax.visualization.picture import write_picture
     from caper_jax.visualization.scene import Scene
 
 __all__ = [
     "ArticulatedPose",
+    "Batch",
     "CaperError",
     "Category",
+    "DatasetReader",
     "Estimator",
+    "Frame",
     "Generator",
     "GeneratorConfig",
     "Joint",
@@ -64,7 +73,9 @@ __all__ = [
     "LossWeights",
     "NetworkConfig",
     "ObjectModel",
+    "Objective",
     "Observation",
+    "Optimizer",
     "Prediction",
     "RunConfig",
     "Scene",
@@ -83,12 +94,14 @@ __all__ = [
     "cloud_from_depth",
     "encoders",
     "estimate",
+    "evaluate",
     "export_estimator",
     "forward_kinematics",
     "geometry",
     "joints_in_camera",
     "load",
     "load_tracker",
+    "mask_from_box",
     "open_dataset",
     "pose_errors",
     "preset",
@@ -97,19 +110,25 @@ __all__ = [
     "read_mask",
     "read_points",
     "register",
+    "register_reader",
+    "sample_points",
     "se3",
     "so3",
     "track_step",
     "train",
+    "train_step",
     "write_picture",
 ]
 
 # Where each name is defined; "module:name" where it is called otherwise there.
 _HOME = {
     "ArticulatedPose": "articulation.pose",
+    "Batch": "data.types",
     "CaperError": "errors",
     "Category": "articulation.category",
+    "DatasetReader": "data.readers.base",
     "Estimator": "estimator",
+    "Frame": "data.types",
     "Generator": "synthetic.frames",
     "GeneratorConfig": "config",
     "Joint": "articulation.category",
@@ -117,7 +136,9 @@ _HOME = {
     "LossWeights": "config",
     "NetworkConfig": "config",
     "ObjectModel": "articulation.category",
+    "Objective": "training.objective",
     "Observation": "tracking.state",
+    "Optimizer": "training.optimizer",
     "Prediction": "estimator",
     "RunConfig": "config",
     "Scene": "visualization.scene",
@@ -132,11 +153,13 @@ _HOME = {
     "Viewpoint": "articulation.category",
     "cloud_from_depth": "data.clouds",
     "estimate": "estimator",
+    "evaluate": "evaluation.protocol",
     "export_estimator": "export",
     "forward_kinematics": "articulation.kinematics",
     "joints_in_camera": "articulation.pose",
     "load": "estimator",
     "load_tracker": "tracker",
+    "mask_from_box": "data.clouds",
     "open_dataset": "data.readers",
     "pose_errors": "evaluation.metrics",
     "preset": "config",
@@ -145,8 +168,11 @@ _HOME = {
     "read_mask": "data.images",
     "read_points": "data.clouds",
     "register": "categories",
+    "register_reader": "data.readers:register",
+    "sample_points": "data.clouds",
     "track_step": "tracking.step",
     "train": "training.train",
+    "train_step": "training.step",
     "write_picture": "visualization.picture",
 }
 _MODULES = {
