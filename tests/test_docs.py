@@ -65,11 +65,19 @@ def options_of(command: str, subcommand: str = "") -> frozenset[str]:
     """The options that ``--help`` of a command names."""
     if command == "test":  # has none of its own
         return frozenset()
+    words = [subcommand] if subcommand else []
+    help_text = printed(command, *words, "--help")
+    if "--help-settings" in help_text:
+        help_text += printed(command, *words, "--help-settings")
+    return frozenset(OPTION.findall(help_text))
+
+
+def printed(command: str, *arguments: str) -> str:
+    """What a command prints."""
     output = io.StringIO()
     with contextlib.redirect_stdout(output), contextlib.suppress(SystemExit):
-        words = [*([subcommand] if subcommand else []), "--help"]
-        benchmark(words) if command == "benchmark" else cli.main([command, *words])
-    return frozenset(OPTION.findall(output.getvalue()))
+        benchmark(arguments) if command == "benchmark" else cli.main([command, *arguments])
+    return output.getvalue()
 
 
 def resolve(name: str) -> object:
