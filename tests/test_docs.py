@@ -21,7 +21,7 @@ from _helpers.tiny import network, random_variables
 import caper_jax
 from benchmarks.__main__ import main as benchmark
 from caper_jax import cli
-from caper_jax.config import LoaderConfig, NetworkConfig, TrackerConfig, preset, update
+from caper_jax.config import LoaderConfig, NetworkConfig, TrackerConfig, override, preset, update
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -184,6 +184,18 @@ def test_settings_exist(page):
         section: Any = sections.get(key[2], preset("fast", "box"))
         for name in key[1].split("."):
             section = section[name] if isinstance(section, dict) else getattr(section, name)
+
+
+@named("page", PAGES)
+def test_settings_on_the_command_line_have_values_that_fit(page):
+    sections = "network|data|loss|training|tracker"
+    given = re.findall(rf"--((?:{sections})\.[\w.-]+)[ =]([^\s`|]+)", page.read_text("utf-8"))
+    for key, value in given:
+        section, _, name = key.replace("-", "_").partition(".")
+        if section == "tracker":
+            override(TrackerConfig(), f"{name}={value}")
+        else:
+            override(preset("fast", "box"), f"{section}.{name}={value}")
 
 
 def test_the_site_builds(tmp_path):
