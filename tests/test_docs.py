@@ -21,7 +21,15 @@ from _helpers.tiny import network, random_variables
 import caper_jax
 from benchmarks.__main__ import main as benchmark
 from caper_jax import cli
-from caper_jax.config import LoaderConfig, NetworkConfig, TrackerConfig, override, preset, update
+from caper_jax.config import (
+    LoaderConfig,
+    NetworkConfig,
+    RegistrationConfig,
+    TrackerConfig,
+    override,
+    preset,
+    update,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -29,6 +37,7 @@ LINKED = [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
 NOT_RUN = "<!-- not run"  # stands in the line before a block that takes too long or needs more
 COMMAND = re.compile(r"\bbin/([a-z]+)((?: [^`|#\n]*)?)")
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
+FEW_STEPS = TrackerConfig(registration=RegistrationConfig(steps=1, gaussians=16, capacity=32))
 HAS_SUBCOMMANDS = ("reproduce", "benchmark")
 
 named = functools.partial(pytest.mark.parametrize, ids=lambda path: path.name)
@@ -104,7 +113,8 @@ def test_python_blocks_run_in_order(page, small_model, tmp_path, monkeypatch):
     monkeypatch.setattr(jax, "jit", quick_jit)
     estimator = caper_jax.Estimator(*small_model)
     monkeypatch.setattr(caper_jax, "load", lambda *_, **__: estimator)
-    monkeypatch.setattr(caper_jax, "load_tracker", lambda *_, **__: caper_jax.Tracker(estimator))
+    tracker = caper_jax.Tracker(estimator, FEW_STEPS)
+    monkeypatch.setattr(caper_jax, "load_tracker", lambda *_, **__: tracker)
     (tmp_path / "caper_jax").symlink_to(ROOT / "caper_jax")
     monkeypatch.chdir(tmp_path)  # what they write goes there
     namespace: dict[str, object] = {"__name__": "__docs__"}
