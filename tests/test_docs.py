@@ -104,7 +104,7 @@ def resolve(name: str) -> object:
 @pytest.fixture(scope="module")
 def small_model() -> tuple[caper_jax.Category, NetworkConfig, Any]:
     """A box, and networks in the place of the shipped ones, which take longer to compile."""
-    category, sizes = caper_jax.categories.get("box"), network()
+    category, sizes = caper_jax.categories.get("box"), network(refine_steps=0)
     return category, sizes, random_variables(category, sizes)
 
 
