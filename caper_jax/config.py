@@ -760,6 +760,8 @@ def _value(text: str, kind: Any) -> Any:
     if typing.get_origin(kind) is tuple and not text.startswith("["):
         item = typing.get_args(kind)[0]
         return [_value(part.strip(), item) for part in text.split(",")]
+    if kind is bool and text in ("True", "False"):  # as --help-settings spells them
+        return text == "True"
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -120,10 +119,8 @@ def export_estimator(
       The manifest.
 
     Raises:
-      CaperError: an unknown platform, none, a batch below 1, or no flatbuffers.
+      CaperError: an unknown platform, none, or a batch below 1.
     """
-    if find_spec("flatbuffers") is None:
-        raise CaperError("exporting needs flatbuffers: pip install 'caper-jax[export]'")
     platforms = tuple(dict.fromkeys(platforms))
     for platform in platforms:
         if platform not in PLATFORMS:
