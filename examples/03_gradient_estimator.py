@@ -42,14 +42,19 @@ def main(category: str, quick: bool, out: Path) -> None:
     value_and_grad = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))
     value, (of_weights, of_points) = value_and_grad(estimator.variables, batch.points)
 
-    # Along the gradient of the points, the loss changes as the gradient says.
-    step = 2e-4 * of_points / jnp.linalg.norm(of_points)
-    sides = [value_and_grad(estimator.variables, batch.points + s * step)[0] for s in (1, -1)]
-    print(f"loss {value:.3e} rad^2")
-    print(f"slope along the points' gradient {float((of_points * step).sum()):.3e},")
-    print(f"by finite differences            {float(sides[0] - sides[1]) / 2:.3e}")
+    # Along the gradient of the weights, the loss changes as the gradient says.
+    length = float(optax.tree.norm(of_weights))
+    rate = 0.05 * float(value) / length**2
 
-    descent = optax.sgd(0.5 * float(value) / float(optax.tree.norm(of_weights)) ** 2)
+    def moved(rate):
+        variables = jax.tree.map(lambda v, g: v + rate * g, estimator.variables, of_weights)
+        return float(value_and_grad(variables, batch.points)[0])
+
+    print(f"loss {value:.3e} rad^2")
+    print(f"slope along the weights' gradient {rate * length**2:.3e},")
+    print(f"by finite differences             {(moved(rate) - moved(-rate)) / 2:.3e}")
+
+    descent = optax.sgd(10 * rate)
     updates, _ = descent.update(of_weights, descent.init(estimator.variables))
     better = optax.apply_updates(estimator.variables, updates)
     print(f"after one step on the weights: {value_and_grad(better, batch.points)[0]:.3e} rad^2")

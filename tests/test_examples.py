@@ -87,7 +87,7 @@ def test_track(tmp_path):
 
 def test_gradient_through_the_estimator(tmp_path):
     text = run("03", "--quick", "--out", tmp_path)
-    slope = number_after(text, "slope along the points' gradient")
+    slope = number_after(text, "slope along the weights' gradient")
     assert slope == pytest.approx(number_after(text, "by finite differences"), rel=0.1)
     assert 0 < number_after(text, "after one step on the weights:") < number_after(text, "loss")
     assert (tmp_path / "gradient.png").is_file()

@@ -319,7 +319,7 @@ class TestReport:
         arguments = (ARM, TrackerConfig(policy="none"), "estimator", "masks", "predicted", None)
         text = format_tracks([self.track("x" * 90 + "/tail"), self.track("short")], *arguments)
         lines = text.splitlines()
-        assert max(map(len, lines)) <= 80
+        assert max(map(len, lines)) <= 100
         assert lines[-2].split()[0].endswith("/tail")
         assert lines[-1].split() == ["short", "3", "1", "1", "2", "20.0"]
 

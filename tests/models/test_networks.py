@@ -344,6 +344,6 @@ def test_stage_two_outputs():
 
 def test_presets():
     assert set(PRESETS) == {"paper", "fast"}
-    assert preset("paper").encoder == "hs"
+    assert preset("paper").network.encoder == "hs"
     with pytest.raises(CaperError, match=r"preset 'fats'; did you mean 'fast'"):
         preset("fats")

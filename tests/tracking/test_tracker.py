@@ -172,11 +172,11 @@ class TestShipped:
         for video in range(VIDEOS):
             player.begin(video, HALF_TURN)
             # Stage II is kept from speaking.
-            silent = replace(player.tracker.state, vote=np.zeros(24, np.float32))
+            silent = replace(player.tracker.state, rotation_votes=np.zeros(24, np.float32))
             player.tracker.state = silent
             errors, _ = player.play(video, range(1, 4))
             assert errors.min() > 150
-            player.tracker.state = replace(silent, trial=np.int32(5))
+            player.tracker.state = replace(silent, init_frames_left=np.int32(5))
             errors, _ = player.play(video, range(1, 5))
             right.append(errors[-1].max() < 15)
             assert player.tracker.state.init_frames_left > 0
