@@ -310,7 +310,7 @@ def test_calibrate_counts_frames_before_it_changes_a_model(model, capsys):
     before = {path.name: path.read_bytes() for path in model.iterdir() if path.is_file()}
     arguments = ["calibrate", "--category", "box", "--weights", str(model)]
     assert cli.main([*arguments, "--refiner", "--refiner-frames", "1024", "--frames", "100"]) == 2
-    assert "2560" in capsys.readouterr().err
+    assert "320" in capsys.readouterr().err
     assert before == {path.name: path.read_bytes() for path in model.iterdir() if path.is_file()}
 
 

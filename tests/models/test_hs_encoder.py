@@ -194,7 +194,7 @@ def test_parameter_count_of_the_paper_preset():
     root = encoder + 2 * head(4) + head(3, extra=3)
     pointwise = head(2, 3, pooled=False) + head(7, 3, pooled=False)
     parts = encoder + pointwise + head(1) + head(12) + head(6)
-    sizes = preset("paper")
+    sizes = preset("paper").network
     modules = (RootNetwork(sizes), PartsNetwork(sizes, box.num_parts))
     for module, expected in zip(modules, (root, parts), strict=True):
         leaves = jax.tree.leaves(shapes_of(module, 1024)["params"])

@@ -156,7 +156,7 @@ class TestModel:
         self, folder, tmp_path, monkeypatch, capsys
     ):
         monkeypatch.setattr(jax, "jit", quick_jit)
-        monkeypatch.setattr("caper_jax.training.train.TRAINING_DATA", self.CONFIG)
+        monkeypatch.setattr("caper_jax.config.TRAINING_DATA", self.CONFIG)
         command = ["calibrate", "--category", "box", "--weights", str(folder), "--frames"]
         assert cli.main([*command, "20"]) == 2
         assert "320 frames or more, got 20" in capsys.readouterr().err

@@ -158,7 +158,7 @@ def test_rendered_videos_as_of_pm_videos(tmp_path, small):
     [
         (["--layout", "pm-videos"], "needs --videos"),
         (["--layout", "artimage", "--videos", "2"], "has no videos"),
-        (["--layout", "artimage", "--images"], "--layout and --images exclude"),
+        (["--layout", "artimage", "--images"], "--images and --layout exclude"),
         (
             ["--layout", "pm-videos", "--videos", "2", "--mode", "cam"],
             "--layout and --mode exclude",

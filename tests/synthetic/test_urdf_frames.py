@@ -163,7 +163,7 @@ def test_command_imports_a_folder_of_models(tmp_path, capsys):
     ("arguments", "message"),
     [
         (("--up", "z"), "--up belongs to --urdf"),
-        (("--urdf", "x.urdf", "--images"), "--urdf and --images exclude each other"),
+        (("--urdf", "x.urdf", "--images"), "--images and --urdf exclude each other"),
         (("--urdf", "x.urdf", "--front", "w"), "'w' is neither x, y, z"),
     ],
 )

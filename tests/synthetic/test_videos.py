@@ -216,7 +216,7 @@ def test_generate_writes_videos_that_read_back(tmp_path, capsys):
         (["--videos", "2", "--frames", "3"], "--videos and --frames exclude each other"),
         (["--mode", "cam"], "--mode is of videos: add --videos N"),
         (["--urdf", URDF, "--points", "1"], "--points must be at least 16, got 1"),
-        ([*ARTIMAGE, "--noise", "kinekt"], "unknown --noise 'kinekt'"),
+        ([*ARTIMAGE, "--noise", "kinekt"], "invalid choice 'kinekt' for argument '--noise'"),
         ([*IMAGES, "--grid", "96"], "--grid has no effect with --images: leave it out"),
     ],
 )
