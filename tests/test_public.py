@@ -24,5 +24,5 @@ def test_the_import_loads_nothing_else():
 
 
 def test_what_is_not_public_is_named():
-    with pytest.raises(AttributeError, match="no attribute 'lod'"):
+    with pytest.raises(AttributeError, match="attribute lod"):
         caper_jax.lod  # noqa: B018

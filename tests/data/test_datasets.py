@@ -136,10 +136,10 @@ class Clouds(DatasetReader):
 
 def test_a_reader_of_ones_own(tmp_path, monkeypatch):
     monkeypatch.setattr(readers, "_READERS", dict(readers._READERS))
-    readers.register("clouds", Clouds)
-    readers.register("clouds", Clouds)
+    readers.register_reader("clouds", Clouds)
+    readers.register_reader("clouds", Clouds)
     with pytest.raises(CaperError, match="'clouds' is already registered"):
-        readers.register("clouds", reader_of("folder"))
+        readers.register_reader("clouds", reader_of("folder"))
     assert "clouds" in formats() and "clouds" in formats(videos=True)
     assert "clouds" not in formats(labeled=True)
 

@@ -1,7 +1,7 @@
 """Readers of labeled datasets, by the name that their layout has on the command line.
 
 A reader of your own is a subclass of ``DatasetReader`` in a file anywhere and one call of
-``register``; inside this package, it is one file here and one line in ``_READERS``.
+``register_reader``; inside this package, it is one file here and one line in ``_READERS``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from caper_jax.errors import CaperError, unknown_name
 if TYPE_CHECKING:
     from caper_jax.data.readers.base import DatasetReader
 
-__all__ = ["categories_in", "formats", "open_dataset", "reader_of", "register", "splits_in"]
+__all__ = ["categories_in", "formats", "open_dataset", "reader_of", "register_reader", "splits_in"]
 
 # Modules of this project's readers, each imported when it is first used.
 _READERS: dict[str, str | type[DatasetReader]] = {
@@ -31,7 +31,7 @@ _READERS: dict[str, str | type[DatasetReader]] = {
 }
 
 
-def register(name: str, reader: type[DatasetReader]) -> None:
+def register_reader(name: str, reader: type[DatasetReader]) -> None:
     """Makes a reader known under a name, for the rest of the process.
 
     Args:
