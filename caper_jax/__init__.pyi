@@ -1,8 +1,7 @@
 # The public names: read by type checkers, and by ``__init__.py`` when it runs.
 
-__version__: str
-
 from . import articulation, categories, geometry
+from ._version import __version__
 from .articulation.category import Category, Joint, ObjectModel, Symmetry, Viewpoint
 from .articulation.kinematics import forward_kinematics
 from .articulation.pose import ArticulatedPose, joints_in_camera
