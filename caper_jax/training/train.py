@@ -54,12 +54,14 @@ _SAMPLE = 512  # frames that give the trivial predictor of the model card
 def preset_of(directory: str | Path, category: str) -> RunConfig:
     """The run of the preset that a model is of, with the network of that model.
 
+    A network with an encoder of one's own is trained as the fast preset is.
+
     Raises:
       CaperError: no model directory, a damaged card, or an unknown category.
     """
     network = network_of(read_card(directory), Path(directory))
-    name = next(name for name, other in PRESETS.items() if other.network.encoder == network.encoder)
-    config = preset(name, category)
+    names = {other.network.encoder: name for name, other in PRESETS.items()}
+    config = preset(names.get(network.encoder, "fast"), category)
     return replace(
         config, network=network, data=replace(config.data, num_points=network.num_points)
     )

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from caper_jax import categories, cli
-from caper_jax.config import LoaderConfig, preset, to_dict
+from caper_jax.config import LoaderConfig, NetworkConfig, preset, to_dict
 from caper_jax.errors import CaperError
 from caper_jax.models.files import read_model, write_card, write_model
 from caper_jax.training import train as run
@@ -220,12 +220,16 @@ def test_a_run_from_a_model_has_its_network(model, tmp_path, monkeypatch):
     assert configured("--preset", "paper") == preset("paper", "laptop")
 
 
-def test_a_run_from_a_published_network_is_of_that_preset(tmp_path):
-    network = {"encoder": "hs", "refine_steps": 2}
+@pytest.mark.parametrize(("encoder", "name"), [("hs", "paper"), ("one of my own", "fast")])
+def test_a_run_from_a_model_is_of_the_preset_with_its_encoder(tmp_path, encoder, name):
+    network = {"encoder": encoder, "refine_steps": 2}
     write_model(tmp_path, {}, {"run": {"network": network}})
     config = run.preset_of(tmp_path, "box")
-    paper = preset("paper", "box")
-    assert config == replace(paper, network=replace(paper.network, refine_steps=2))
+    wanted = preset(name, "box")
+    network = replace(
+        NetworkConfig(encoder=encoder), refine_steps=2, num_points=wanted.data.num_points
+    )
+    assert config == replace(wanted, network=network)
 
 
 def test_all_categories_one_after_the_other(model, tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Correction by the sides of boxes: features against numpy, targets that undo errors, a fit."""
+"""The refiner: features against numpy, targets that undo errors, a fit."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def without(estimator):
     return Estimator(estimator.category, network, estimator.variables, estimator.card)
 
 
-def test_shipped_sides_help():
+def test_shipped_refiners_help():
     estimator, batch = load("box"), frames(BOX)
     with_them, alone = errors(estimator, batch), errors(without(estimator), batch)
     assert with_them[0] < 0.9 * alone[0] and with_them[1] < 0.95 * alone[1]
