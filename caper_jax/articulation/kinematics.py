@@ -149,67 +149,51 @@ def forward_kinematics(
 
 def joint_transform_float64(
     joint_type: str,
-    axis: Float[np.ndarray, " 3"],
-    pivot: Float[np.ndarray, " 3"],
-    state: float,
-) -> Float[np.ndarray, "4 4"]:
-    """``joints.joint_transform`` of one joint with a unit axis, in float64 without JAX.
+    axis: Float[np.ndarray, "*batch 3"],
+    pivot: Float[np.ndarray, "*batch 3"],
+    state: float | Shaped[np.ndarray, "*batch"],
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """``joint_transform`` of a joint with a unit axis, in float64 without JAX.
 
     For files, whose meshes must not move by the rounding of float32.
 
     Args:
       joint_type: "revolute" or "prismatic".
-      axis: [3] unit vector.
-      pivot: [3] meters; without effect on a prismatic joint.
-      state: radians or meters.
-
-    Returns:
-      [4, 4].
+      axis: [..., 3] unit vectors.
+      pivot: [..., 3] meters; without effect on a prismatic joint.
+      state: [...] radians or meters.
 
     Raises:
       CaperError: unknown joint type.
     """
     from scipy.spatial.transform import Rotation  # importing it costs 0.1 s
 
-    motion = np.eye(4)
+    shift = np.asarray(state)[..., None] * axis
+    motion = np.broadcast_to(np.eye(4), (*shift.shape[:-1], 4, 4)).copy()
     if joint_type == "prismatic":
-        motion[:3, 3] = state * axis
+        motion[..., :3, 3] = shift
     elif joint_type == "revolute":
-        motion[:3, :3] = Rotation.from_rotvec(state * axis).as_matrix()
-        motion[:3, 3] = pivot - motion[:3, :3] @ pivot
+        turn = Rotation.from_rotvec(shift.reshape(-1, 3)).as_matrix().reshape(*shift.shape, 3)
+        motion[..., :3, :3] = turn
+        motion[..., :3, 3] = pivot - (turn @ pivot[..., None])[..., 0]
     else:
         raise unknown_name("joint type", joint_type, ("revolute", "prismatic"))
     return motion
 
 
 def forward_kinematics_float64(
-    root: Float[np.ndarray, "4 4"],
-    axis: Float[np.ndarray, "J 3"],
-    pivot: Float[np.ndarray, "J 3"],
-    state: Shaped[np.ndarray, " J"],
+    root: Float[np.ndarray, "*batch 4 4"],
+    axis: Float[np.ndarray, "*batch J 3"],
+    pivot: Float[np.ndarray, "*batch J 3"],
+    state: Shaped[np.ndarray, "*batch J"],
     joint_types: Sequence[str],
     parents: Sequence[int],
-) -> Float[np.ndarray, "K 4 4"]:
-    """``forward_kinematics`` of one object with unit axes, in float64 without JAX.
-
-    Args:
-      root: [4, 4] pose of part 0.
-      axis: [J, 3] unit joint axes.
-      pivot: [J, 3] meters.
-      state: [J] radians or meters from the rest pose.
-      joint_types: J times "revolute" or "prismatic".
-      parents: J parent parts; a parent comes before its child.
-
-    Returns:
-      [K, 4, 4].
-
-    Raises:
-      CaperError: unknown joint type.
-    """
+) -> Float[np.ndarray, "*batch K 4 4"]:
+    """``forward_kinematics`` with unit axes, in float64 without JAX; the same arguments."""
     poses = [np.asarray(root, np.float64)]
-    for joint, parent in enumerate(parents):
+    for j, (joint_type, parent) in enumerate(zip(joint_types, parents, strict=True)):
         motion = joint_transform_float64(
-            joint_types[joint], axis[joint], pivot[joint], float(state[joint])
+            joint_type, axis[..., j, :], pivot[..., j, :], np.asarray(state)[..., j]
         )
         poses.append(poses[parent] @ motion)
-    return np.stack(poses)
+    return np.stack(poses, axis=-3)

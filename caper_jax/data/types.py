@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import flax.struct
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int32
 
-from caper_jax.articulation.kinematics import forward_kinematics
+from caper_jax.articulation.kinematics import forward_kinematics_float64
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.errors import CaperError
 
@@ -260,7 +258,10 @@ def _kinematics_problems(arrays: dict[str, np.ndarray], category: Category) -> l
     root[..., :3, :3], root[..., 3, 3] = arrays["rotation"][..., 0, :, :], 1.0
     root[..., :3, 3] = arrays["translation"][..., 0, :]
     axis, pivot, state = (arrays[f"joint_{field}"] for field in ("axis", "pivot", "state"))
-    expected = part_poses(root, axis, pivot, state, category)
+    axis = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
+    expected = forward_kinematics_float64(
+        root, axis, pivot, state, category.joint_types, category.parents
+    )
     # The chord |R - R'| / sqrt 2 equals the angle between the rotations to first order.
     chord = np.linalg.norm(expected[..., :3, :3] - arrays["rotation"], axis=(-1, -2)) / np.sqrt(2)
     distance = np.linalg.norm(expected[..., :3, 3] - arrays["translation"], axis=-1)
@@ -273,22 +274,6 @@ def _kinematics_problems(arrays: dict[str, np.ndarray], category: Category) -> l
         f"{np.degrees(chord.max()):.2g} deg, {distance.max():.2g} m){_first(apart)}: check the "
         "sign and unit of joint_state, and that axis and pivot are in the root's rest frame"
     ]
-
-
-def part_poses(
-    root: Float64[np.ndarray, "*batch 4 4"],
-    axis: Float64[np.ndarray, "*batch J 3"],
-    pivot: Float64[np.ndarray, "*batch J 3"],
-    state: Float64[np.ndarray, "*batch J"],
-    category: Category,
-) -> Float64[np.ndarray, "*batch K 4 4"]:
-    """``forward_kinematics`` of a category in float64, for files."""
-    with jax.enable_x64(True):
-        joints = category.joint_types, category.parents
-        return np.asarray(_forward_kinematics(root, axis, pivot, state, *joints))
-
-
-_forward_kinematics = partial(jax.jit, static_argnums=(4, 5))(forward_kinematics)
 
 
 def _cloud_problems(frame: Frame, num_parts: int) -> list[str]:

@@ -34,6 +34,7 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.conversions import ArtImageConversion, AxisMap, Front, RestObject
+from caper_jax.articulation.kinematics import forward_kinematics_float64
 from caper_jax.data.images import check_values, read_json
 from caper_jax.data.readers.annotations import Model
 from caper_jax.data.readers.base import Schema
@@ -47,7 +48,6 @@ from caper_jax.data.readers.public_urdf import (
     parse_urdf,
     read_joints,
 )
-from caper_jax.data.types import part_poses
 from caper_jax.errors import CaperError
 
 REST_STATES = "rest_state.json"
@@ -90,7 +90,9 @@ def read_model(
     for joint, parent in zip(joints, category.parents, strict=True):
         pivots.append(joint.xyz[POINT_ORDER] + pivots[parent])
     root = _base_change(home) if conversion.moved_by_base else np.eye(4)
-    poses = part_poses(root, axes, np.array(pivots[1:]), senses * states, category)
+    poses = forward_kinematics_float64(
+        root, axes, np.array(pivots[1:]), senses * states, category.joint_types, category.parents
+    )
 
     carriers = poses[list(category.parents)]
     turned = np.einsum("jab,jb->ja", carriers[:, :3, :3], axes)

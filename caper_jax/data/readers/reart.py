@@ -40,6 +40,7 @@ from pydantic import PlainValidator
 from caper_jax import categories
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.conversions import ReArtConversion, StoredObject
+from caper_jax.articulation.kinematics import forward_kinematics_float64
 from caper_jax.data import safe_pickle
 from caper_jax.data.images import check_values, read_depth, read_json_as
 from caper_jax.data.readers.annotations import (
@@ -57,7 +58,7 @@ from caper_jax.data.readers.annotations import (
 from caper_jax.data.readers.artimage import SingleAnnotation, object_named_in
 from caper_jax.data.readers.base import ALL, DatasetReader, Schema, in_natural_order, read_list
 from caper_jax.data.readers.public_urdf import ALIGNED, moving_joints
-from caper_jax.data.types import Frame, checked_array, part_poses
+from caper_jax.data.types import Frame, checked_array
 from caper_jax.errors import CaperError
 
 _CATEGORY_ID = re.compile(rb'"category_id"\s*:\s*(\d+)')
@@ -330,10 +331,13 @@ def rest_model(meta: _Meta, category: Category, conversion: ReArtConversion, whe
     stored = _stored_object(meta, category, conversion, where)
     axes = np.array(conversion.axes)
     states = np.full(category.num_joints, -conversion.stored_state(stored))
-    rest = part_poses(np.eye(4), stored.axis, stored.pivot, states, category)
+    tree = category.joint_types, category.parents
+    rest = forward_kinematics_float64(np.eye(4), stored.axis, stored.pivot, states, *tree)
     # Measured axes are off by up to 6 deg; what is built square turns about the ideal one.
     ideal_axis = np.tile(conversion.opening, (category.num_joints, 1))
-    ideal = part_poses(np.eye(4), ideal_axis, np.zeros_like(stored.pivot), states, category)
+    ideal = forward_kinematics_float64(
+        np.eye(4), ideal_axis, np.zeros_like(stored.pivot), states, *tree
+    )
 
     extents = stored.high - stored.low
     middles = np.einsum("kij,kj->ki", rest[:, :3, :3], (stored.low + stored.high) / 2)
