@@ -1,10 +1,13 @@
-"""The one exception type for mistakes in what a user gave."""
+"""The one exception type for mistakes in what a user gave, and how they are worded."""
 
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 from typing import Any
+
+_TYPE = re.compile(r"int|float|str|list\[.*\]")
 
 
 class CaperError(ValueError):
@@ -30,19 +33,26 @@ def describe_problem(error: Any) -> str:
       error: as raised by ``validate_python`` or ``validate_json``.
     """
     problem = error.errors()[0]
-    key = ".".join(map(str, problem["loc"])) or "the value"
+    # Of alternatives such as ``int | str``, pydantic adds the type that it tried.
+    names = [str(name) for name in problem["loc"] if not _TYPE.fullmatch(str(name))]
+    key, value = ".".join(names) or "the content", problem["input"]
+    if problem["type"] == "json_invalid":
+        return f"broken JSON ({problem['ctx']['error']})"
     if problem["type"] == "missing":
         return f"{key} is missing"
-    if problem["type"] == "literal_error" and isinstance(problem["input"], str):
-        names = problem["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", ")
-        return str(unknown_name(key, problem["input"], names))
+    if problem["type"] == "literal_error" and isinstance(value, str):
+        known = problem["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", ")
+        return str(unknown_name(key, value, known))
+    message = re.sub(r"^(Input|List|Tuple|String|Dictionary) should", "must", problem["msg"])
     message = (
-        problem["msg"]
-        .replace("Input should be", "must be")
-        .replace("greater than or equal to", "at least")
+        message.replace("greater than or equal to", "at least")
         .replace("less than or equal to", "at most")
         .replace("greater than", "above")
         .replace("less than", "below")
         .removeprefix("Value error, ")
     )
-    return f"{key} {message}, got {problem['input']!r}"
+    return f"{key} {message}, got {_short(repr(value))}"
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,14 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 from PIL import Image, UnidentifiedImageError
 
-from caper_jax.errors import CaperError
+from caper_jax.errors import CaperError, describe_problem
 
 _MILLIMETER = 1e-3
 # No depth camera sees objects nearer than 2 cm, or resolves one beyond 50 m.
 _NEAREST_M, _FARTHEST_M = 0.02, 50.0
 
 Schema = TypeVar("Schema")
-_TYPE = re.compile(r"int|float|str|list\[.*\]")
 
 
 def read_depth(path: str | Path, scale: float | None = None) -> Float32[np.ndarray, "H W"]:
@@ -229,7 +227,7 @@ def read_json_as(path: str | Path, schema: type[Schema]) -> Schema:
     except OSError as error:
         raise CaperError(f"{path}: cannot be read ({error})") from error
     except ValidationError as error:
-        raise CaperError(f"{path}: {_first_problem(error.errors()[0])}") from error
+        raise CaperError(f"{path}: {describe_problem(error)}") from error
 
 
 def check_values(schema: type[Schema], values: Any, where: str) -> Schema:
@@ -248,7 +246,7 @@ def check_values(schema: type[Schema], values: Any, where: str) -> Schema:
     try:
         return _adapter_of(cast(Any, schema)).validate_python(values)
     except ValidationError as error:
-        raise CaperError(f"{where}: {_first_problem(error.errors()[0])}") from error
+        raise CaperError(f"{where}: {describe_problem(error)}") from error
 
 
 @cache
@@ -256,21 +254,6 @@ def _adapter_of(schema: Any) -> Any:
     from pydantic import TypeAdapter
 
     return TypeAdapter(schema)
-
-
-def _first_problem(problem: Any) -> str:
-    """What pydantic says of a field, in one line."""
-    *parents, name = problem["loc"] or ("the content",)
-    if problem["type"] == "json_invalid":
-        return f"broken JSON ({problem['ctx']['error']})"
-    if problem["type"] == "missing":
-        return f"{'.'.join(map(str, parents)) or 'it'} lacks {name!r}"
-    # Of alternatives such as ``int | str``, pydantic adds the type that it tried.
-    field = ".".join(str(part) for part in (*parents, name) if not _TYPE.fullmatch(str(part)))
-    reason = re.sub(r"^(Input|List|Tuple|String|Dictionary) should", "must", problem["msg"])
-    value = repr(problem["input"])
-    value = value if len(value) <= 60 else f"{value[:57]}..."
-    return f"{field}: {reason.removeprefix('Value error, ')}, got {value}"
 
 
 @dataclass(frozen=True)

@@ -82,8 +82,8 @@ def test_everything_wrong_with_images_is_listed_at_once(tmp_path, capsys):
         r"test.txt: names '000099.json', which has no annotation",
         "000000.json: broken JSON",
         "depth/000001.png: no such file",
-        "000002.json, link 0: transformation: must be a scaled rotation, has determinant -1",
-        "000003.json, link 1: transformation: must be 4 x 4 finite numbers",
+        "000002.json, link 0: transformation must be a scaled rotation, has determinant -1",
+        "000003.json, link 1: transformation must be 4 x 4 finite numbers",
         "000004: labels: put only",
         "000004: labels: put only",
     ]

@@ -185,11 +185,11 @@ def test_every_layout_of_intrinsics(tmp_path, content):
         ({"K": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]}, "last row of K must be 0 0 1"),
         ({"K": [[1, 2], [3, 4]]}, "K must be 9 numbers"),
         ({"K": [[1, 0], [3, 4, 5], 2]}, "K must be 9 numbers"),
-        ({"K": [float("nan")] * 9}, r"K\.0: "),
+        ({"K": [float("nan")] * 9}, r"K\.0 "),
         ({"K": (EXPECTED * [1, -1, 1]).tolist()}, "focal lengths must be positive"),
         ({"K": np.add(EXPECTED, [[0, 1, 0], [0, 0, 0], [0, 0, 0]]).tolist()}, "has skew"),
         ({"fx": 900, "cx": 3, "cy": 4}, "lacks fy"),
-        ({"fx": "900", "fy": 900, "cx": 3, "cy": 4}, r"camera\.json: fx: .*'900'"),
+        ({"fx": "900", "fy": 900, "cx": 3, "cy": 4}, r"camera\.json: fx .*'900'"),
         ({"focal": 900}, "no camera matrix"),
         ([914.2, 913.0], r"camera\.json: "),
         (
