@@ -23,8 +23,7 @@ from caper_jax.data.images import read_json
 from caper_jax.data.readers.artimage_models import POINTS, REST_STATES
 from caper_jax.data.readers.public_urdf import ALIGNED, POINT_ORDER, RAW
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solid_surface import surface_points
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solids import bounds, surface_points
 from caper_jax.synthetic.images import Image
 
 _POINTS_PER_PART = 2048

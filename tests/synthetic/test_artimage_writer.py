@@ -14,8 +14,7 @@ from caper_jax.cli import generate
 from caper_jax.data.readers import open_dataset
 from caper_jax.data.types import validate
 from caper_jax.errors import CaperError
-from caper_jax.geometry.solid_surface import surface_points
-from caper_jax.geometry.solids import bounds
+from caper_jax.geometry.solids import bounds, surface_points
 from caper_jax.synthetic.artimage_writer import LayoutWriter
 from caper_jax.synthetic.images import Image
 from caper_jax.synthetic.instances import draw_instances
