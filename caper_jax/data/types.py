@@ -165,6 +165,17 @@ def checked_array(
     return np.asarray(value)
 
 
+def finite_array(value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Float64 numbers of a shape from (nested lists of) numbers; ValueError for anything else."""
+    try:
+        array = np.asarray(value, np.float64).reshape(shape)
+    except (TypeError, ValueError, OverflowError):
+        array = np.full(1, np.nan)
+    if not np.isfinite(array).all():
+        raise ValueError(f"must be {' x '.join(map(str, shape))} finite numbers")
+    return array
+
+
 def pose_shapes(num_parts: int) -> dict[str, tuple[int, ...]]:
     """Shape of every field of an unbatched ``ArticulatedPose`` with ``num_parts`` parts."""
     joints = num_parts - 1

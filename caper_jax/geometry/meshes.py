@@ -112,21 +112,26 @@ def _plain(vertices: Any, faces: Any) -> Mesh:
     return Mesh(vertices[used], faces.reshape(-1, 3))
 
 
-def primitive_mesh(geometry: Any, where: str) -> Mesh:
+def primitive_mesh(kind: str, numbers: Sequence[float], where: str) -> Mesh:
     """A URDF box, cylinder (along z) or sphere, centered on its frame.
+
+    Args:
+      kind: the name of its element.
+      numbers: lengths of a box, radius and length of a cylinder, or radius of a sphere; meters.
+      where: the file and link, for errors.
 
     Raises:
       CaperError: another shape.
     """
     import trimesh
 
-    if geometry.box is not None:
-        surface = trimesh.creation.box(extents=geometry.box.size)
-    elif geometry.cylinder is not None:
-        cylinder = geometry.cylinder
-        surface = trimesh.creation.cylinder(cylinder.radius, cylinder.length, sections=96)
-    elif geometry.sphere is not None:
-        surface = trimesh.creation.icosphere(subdivisions=4, radius=geometry.sphere.radius)
+    if kind == "box":
+        surface = trimesh.creation.box(extents=numbers)
+    elif kind == "cylinder":
+        radius, length = numbers
+        surface = trimesh.creation.cylinder(radius, length, sections=96)
+    elif kind == "sphere":
+        surface = trimesh.creation.icosphere(subdivisions=4, radius=numbers[0])
     else:
-        raise CaperError(f"{where}: a geometry that is neither mesh, box, cylinder nor sphere")
+        raise CaperError(f"{where}: <{kind}> is neither mesh, box, cylinder nor sphere")
     return _plain(surface.vertices, surface.faces)

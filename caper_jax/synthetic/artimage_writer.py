@@ -20,8 +20,7 @@ from PIL import Image as Picture
 
 from caper_jax.articulation.category import Category, ObjectModel
 from caper_jax.data.images import read_json
-from caper_jax.data.readers.artimage_models import POINTS, REST_STATES
-from caper_jax.data.readers.public_urdf import ALIGNED, POINT_ORDER, RAW
+from caper_jax.data.readers.artimage_models import ALIGNED, POINT_ORDER, POINTS, RAW, REST_STATES
 from caper_jax.errors import CaperError
 from caper_jax.geometry.solids import bounds, surface_points
 from caper_jax.synthetic.images import Image

@@ -23,21 +23,10 @@ from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.clouds import MIN_POINTS, cloud_from_depth
 from caper_jax.data.images import check_values
 from caper_jax.data.readers.base import Schema
-from caper_jax.data.types import Frame
+from caper_jax.data.types import Frame, finite_array
 from caper_jax.errors import CaperError
 
 _SCALE_TOLERANCE = 1e-3
-
-
-def finite_array(value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Float64 numbers of a shape from (nested lists of) numbers; ValueError for anything else."""
-    try:
-        array = np.asarray(value, np.float64).reshape(shape)
-    except (TypeError, ValueError, OverflowError):
-        array = np.full(1, np.nan)
-    if not np.isfinite(array).all():
-        raise ValueError(f"must be {' x '.join(map(str, shape))} finite numbers")
-    return array
 
 
 LinkSchema = TypeVar("LinkSchema", bound="Link")

@@ -25,6 +25,7 @@ is assumed, not verified. Objects of a category without a conversion are taken t
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -38,20 +39,22 @@ from caper_jax.articulation.kinematics import forward_kinematics_float64
 from caper_jax.data.images import check_values, read_json
 from caper_jax.data.readers.annotations import Model
 from caper_jax.data.readers.base import Schema
-from caper_jax.data.readers.public_urdf import (
-    ALIGNED,
-    POINT_ORDER,
-    RAW,
+from caper_jax.data.urdf.xml import (
     UrdfJoint,
-    moving_joints,
+    attribute,
     number_of,
     parse_urdf,
     read_joints,
+    vector,
 )
 from caper_jax.errors import CaperError
 
 REST_STATES = "rest_state.json"
 POINTS = "part_point_sample"
+ALIGNED, RAW = "mobility_for_unity_align.urdf", "mobility_for_unity.urdf"
+# x, y, z of origins and axes in these files are the third, first and second coordinate of the
+# points.
+POINT_ORDER = [1, 2, 0]
 _LEAST_SHARE = 0.3  # of a direction must be horizontal to tell where the front is
 _LEAST_COSINE = 0.5  # between a joint's axis and the one it must be
 
@@ -88,7 +91,7 @@ def read_model(
     axes = np.array([joint.axis for joint in joints])[:, POINT_ORDER]
     pivots = [np.zeros(3)]
     for joint, parent in zip(joints, category.parents, strict=True):
-        pivots.append(joint.xyz[POINT_ORDER] + pivots[parent])
+        pivots.append(joint.origin[:3, 3][POINT_ORDER] + pivots[parent])
     root = _base_change(home) if conversion.moved_by_base else np.eye(4)
     poses = forward_kinematics_float64(
         root, axes, np.array(pivots[1:]), senses * states, category.joint_types, category.parents
@@ -178,6 +181,32 @@ def rest_model(rest: RestObject, poses: Sequence[np.ndarray] | np.ndarray, axes:
     )
 
 
+def moving_joints(path: Path, pattern: str) -> list[UrdfJoint]:
+    """The joints of a URDF that move, joint j the one of link j + 1.
+
+    Args:
+      path: the file.
+      pattern: finds the number of the link that a joint moves, its first group, in its name.
+
+    Raises:
+      CaperError: see ``read_joints``; or names that do not number the links from 1.
+    """
+    numbered = {}
+    for joint in read_joints(parse_urdf(path), path):
+        number = re.search(pattern, joint.name)
+        if joint.kind == "fixed":
+            continue
+        if number is None or int(number[1]) in numbered:
+            raise CaperError(
+                f"{path}, joint {joint.name!r}: the name must tell which link it moves, and no "
+                "other joint's the same"
+            )
+        numbered[int(number[1])] = joint
+    if sorted(numbered) != list(range(1, len(numbered) + 1)):
+        raise CaperError(f"{path}: joints move links {sorted(numbered)}, expected 1, 2, ...")
+    return [numbered[number] for number in sorted(numbered)]
+
+
 def _read_joints(path: Path, category: Category) -> list[UrdfJoint]:
     """J joints in the order of their child links, checked against the category's tree."""
     joints = moving_joints(path, r"(\d+)$")
@@ -212,20 +241,23 @@ def _rest_states(path: Path, object_id: str, joints: list[UrdfJoint]) -> np.ndar
 
 def _base_change(home: Path) -> np.ndarray:
     """[4, 4]: aligned minus raw base joint, as public loaders compute it."""
-    base, raw = (_base_joint(home / name) for name in (ALIGNED, RAW))
+    base, raw = (_base_origin(home / name) for name in (ALIGNED, RAW))
     change = np.eye(4)
     # (r, p, y) count as turns by -r, y and -p about z, x and y, one after the other (intrinsic).
-    angles = (base.rpy - raw.rpy)[[0, 2, 1]] * (-1, 1, -1)
+    xyz, angles = (base - raw)[:, [0, 2, 1]] * (-1, 1, -1)
     change[:3, :3] = Rotation.from_euler("ZXY", angles).as_matrix()
-    change[:3, 3] = (base.xyz - raw.xyz)[[0, 2, 1]] * (-1, 1, -1)
+    change[:3, 3] = xyz
     return change
 
 
-def _base_joint(path: Path) -> UrdfJoint:
-    """The joint that is numbered 0."""
-    for joint in read_joints(parse_urdf(path), path):
-        if joint.name.split("_")[1:2] == ["0"]:
-            return joint
+def _base_origin(path: Path) -> np.ndarray:
+    """[2, 3] xyz and rpy of the joint that is numbered 0."""
+    for joint in parse_urdf(path).iterfind("joint"):
+        name = joint.get("name", "")
+        if name.split("_")[1:2] == ["0"]:
+            where = f"{path}, joint {name!r}, origin"
+            texts = [attribute(joint, "origin", key, "0 0 0") for key in ("xyz", "rpy")]
+            return np.stack([vector(text, where) for text in texts])
     raise CaperError(f"{path}: lacks the base joint (name <text>_0)")
 
 

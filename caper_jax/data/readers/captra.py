@@ -46,24 +46,15 @@ from caper_jax.data.images import check_values
 from caper_jax.data.readers.annotations import (
     Model,
     ScaledPose,
-    finite_array,
     labeled_frame,
     pose_of_parts,
 )
 from caper_jax.data.readers.artimage_models import canonical_axes, rest_model
 from caper_jax.data.readers.base import ALL, DatasetReader, Schema, group_videos, in_natural_order
-from caper_jax.data.readers.public_urdf import (
-    UrdfJoint,
-    number_of,
-    parse_urdf,
-    pose_of,
-    pose_of_origin,
-    read_joints,
-    vector,
-)
-from caper_jax.data.types import Frame, checked_array
+from caper_jax.data.types import Frame, checked_array, finite_array
+from caper_jax.data.urdf.xml import UrdfJoint, number_of, parse_urdf, read_joints, read_shapes
 from caper_jax.errors import CaperError, unknown_name
-from caper_jax.geometry.meshes import Mesh, join, read_mesh
+from caper_jax.geometry.meshes import Mesh, join
 
 _PLACES = {"train": "render", "test": "render_seq"}
 # Axes of the files' camera (ahead, left, up) -> OpenCV's (right, down, ahead).
@@ -237,7 +228,7 @@ def read_model(folder: Path, category: Category, conversion: CaptraConversion) -
     # Everything in the frame of the root's mesh, which is upright, as the file holds it.
     upright = np.linalg.inv(visuals[0][0])
     moving = [joints[link] for link in links[1:]]
-    poses = [upright, *(upright @ pose_of(joint.xyz, joint.rpy) for joint in moving)]
+    poses = [upright, *(upright @ joint.origin for joint in moving)]
     reference = MeshObject(
         parts=tuple(mesh.moved(pose) for (_, mesh), pose in zip(visuals, poses, strict=True)),
         kinds=tuple(joint.kind for joint in moving),
@@ -302,19 +293,10 @@ def _root(joints: dict[int | None, UrdfJoint], path: Path, category: Category) -
 
 def _read_visuals(robot: ElementTree.Element, path: Path, number: int) -> tuple[np.ndarray, Mesh]:
     """Pose [4, 4] of a link's first mesh in the link, and all its meshes in the link's frame."""
-    poses, meshes = [], []
-    for visual in robot.iterfind(f"link[@name='link_{number}']/visual"):
-        geometry = visual.find("geometry/mesh")
-        if geometry is None or not geometry.get("filename"):
-            raise CaperError(f"{path}, link_{number}: a <visual> lacks <mesh filename=...>")
-        where = f"{path}, link_{number}, visual"
-        pose = pose_of_origin(visual, where)
-        mesh = read_mesh(path.parent / str(geometry.get("filename")))
-        if not len(mesh.faces):
-            raise CaperError(f"{path.parent / str(geometry.get('filename'))}: has no faces")
-        scale = vector(geometry.get("scale", "1 1 1"), f"{where} scale")
-        poses.append(pose)
-        meshes.append(mesh.scaled(scale).moved(pose))
-    if not meshes:
+    link = robot.find(f"link[@name='link_{number}']")
+    shapes = [] if link is None else read_shapes(link, "visual", path)
+    if not shapes:
         raise CaperError(f"{path}: no link_{number} with a mesh")
-    return poses[0], join(meshes)
+    if not all(len(mesh.faces) for _, mesh in shapes):
+        raise CaperError(f"{path}, link_{number}: a mesh has no faces")
+    return shapes[0][0], join([mesh for _, mesh in shapes])

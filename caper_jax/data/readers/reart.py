@@ -49,16 +49,15 @@ from caper_jax.data.readers.annotations import (
     Model,
     OutlinedLink,
     check_image_size,
-    finite_array,
     labeled_frame,
     ordered_links,
     polygon_labels,
     pose_of_parts,
 )
 from caper_jax.data.readers.artimage import SingleAnnotation, object_named_in
+from caper_jax.data.readers.artimage_models import ALIGNED, moving_joints
 from caper_jax.data.readers.base import ALL, DatasetReader, Schema, in_natural_order, read_list
-from caper_jax.data.readers.public_urdf import ALIGNED, moving_joints
-from caper_jax.data.types import Frame, checked_array
+from caper_jax.data.types import Frame, checked_array, finite_array
 from caper_jax.errors import CaperError
 
 _CATEGORY_ID = re.compile(rb'"category_id"\s*:\s*(\d+)')
@@ -303,7 +302,7 @@ class ReArtVideosDataset(_ReArtReader):
             category_name=self.category.name,
             corner_pts=corners,
             joint_rpy=[joint.axis.tolist() for joint in joints],
-            joint_xyz=[joint.xyz.tolist() for joint in joints],
+            joint_xyz=[joint.origin[:3, 3].tolist() for joint in joints],
             # Public loaders take every joint to be mounted on the root.
             joint_parents=[1] * len(joints),
             joint_children=list(range(2, len(joints) + 2)),

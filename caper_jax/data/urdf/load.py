@@ -7,60 +7,20 @@ Any URDF is read, and the folders of PartNet-Mobility: mobility.urdf, and option
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from io import BytesIO
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from caper_jax.articulation.kinematics import joint_transform_float64
 from caper_jax.data.images import read_json
+from caper_jax.data.urdf.xml import UrdfJoint, parse_urdf, read_joints, read_shapes
 from caper_jax.errors import CaperError
-from caper_jax.geometry.meshes import NEEDS_MESH, Mesh, join, primitive_mesh, read_mesh
+from caper_jax.geometry.meshes import Mesh, join
 
 PARTNET_URDF = "mobility.urdf"  # the name of the file in PartNet-Mobility
-Kind = Literal["revolute", "prismatic", "fixed"]
-_KINDS: dict[str, Kind] = {
-    "revolute": "revolute",
-    "continuous": "revolute",
-    "prismatic": "prismatic",
-}
-
-
-@dataclass(frozen=True)
-class UrdfJoint:
-    """A joint as the file gives it.
-
-    Attributes:
-      name: as in the file.
-      kind: "revolute" (also for continuous joints), "prismatic", or "fixed" (also for floating
-        and planar joints, and empty ranges).
-      parent, child: names of links.
-      origin: [4, 4] joint frame -> parent link's frame at state 0.
-      axis: [3] unit vector, joint frame.
-      limits: (low, high) radians or meters; infinite where the file gives none.
-      remark: why a joint that moves in the file has no state of its own, or "".
-      mimic: (name of the joint it follows, multiplier, offset), or None.
-    """
-
-    name: str
-    kind: Kind
-    parent: str
-    child: str
-    origin: Float[np.ndarray, "4 4"]
-    axis: Float[np.ndarray, " 3"]
-    limits: tuple[float, float]
-    remark: str = ""
-    mimic: tuple[str, float, float] | None = None
-
-    @property
-    def moves(self) -> bool:
-        """Whether it has a state of its own."""
-        return self.kind != "fixed" and self.mimic is None
 
 
 @dataclass(frozen=True)
@@ -127,20 +87,25 @@ def read_urdf(path: str | Path) -> UrdfModel:
     no visual one).
 
     Raises:
-      CaperError: no such file, no URDF, no tree of links, a mesh that is missing or unreadable,
-        a malformed PartNet-Mobility file, or the packages for meshes are not installed.
+      CaperError: no such file, no URDF, no tree of links, a mesh that is missing or unreadable, or
+        a malformed PartNet-Mobility file.
     """
     path = Path(path)
-    robot = _parse(path)
-    names = [link.name for link in robot.links]
+    robot = parse_urdf(path)
+    if robot.tag != "robot":
+        raise CaperError(f"{path}: no URDF: its outermost element is <{robot.tag}>, not <robot>")
+    names = [link.get("name", "") for link in robot.iterfind("link")]
     if not names:
         raise CaperError(f"{path}: no URDF, it describes no link")
     if len(set(names)) != len(names):
         raise CaperError(f"{path}: two links share one name")
-    joints = tuple(_joint(path, joint) for joint in robot.joints)
+    joints = tuple(_usable(path, joint) for joint in read_joints(robot, path))
     root = _root(path, names, joints)
-    source = "visuals" if any(link.visuals for link in robot.links) else "collisions"
-    links = {link.name: _link_mesh(path, link, getattr(link, source)) for link in robot.links}
+    source = "visual" if robot.find("link/visual") is not None else "collision"
+    links: dict[str, Mesh | None] = {}
+    for link in robot.iterfind("link"):
+        meshes = [mesh for _, mesh in read_shapes(link, source, path) if len(mesh.faces)]
+        links[link.get("name", "")] = join(meshes) if meshes else None
     if all(mesh is None for mesh in links.values()):
         raise CaperError(f"{path}: no link has a geometry")
     partnet = path.name == PARTNET_URDF
@@ -155,69 +120,14 @@ def read_urdf(path: str | Path) -> UrdfModel:
     )
 
 
-def _parse(path: Path) -> Any:
-    """The file as yourdfpy's Robot, without meshes."""
-    try:
-        from yourdfpy import URDF
-        from yourdfpy.urdf import URDFError
-    except ImportError:
-        raise CaperError(f"reading URDF files {NEEDS_MESH}") from None
-    from xml.etree import ElementTree
-
-    if not path.is_file():
-        raise CaperError(f"{path}: no such file")
-    try:
-        root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, UnicodeDecodeError, ValueError) as error:
-        raise CaperError(f"{path}: not an XML file ({error})") from error
-    if root.tag != "robot":
-        raise CaperError(f"{path}: no URDF: its outermost element is <{root.tag}>, not <robot>")
-    for child in list(root):
-        # What simulators and controllers add is often incomplete, and nothing to us.
-        if child.tag not in ("link", "joint"):
-            root.remove(child)
-    root.attrib.setdefault("name", path.stem)
-    content = BytesIO(ElementTree.tostring(root))
-    try:
-        return URDF.load(content, build_scene_graph=False, load_meshes=False).robot
-    except (URDFError, ValueError, TypeError, KeyError, AttributeError) as error:
-        # Missing attributes come as a KeyError with nothing but their name.
-        raise CaperError(f"{path}: malformed URDF ({error!r})") from error
-
-
-def _joint(path: Path, joint: Any) -> UrdfJoint:
-    where = f"{path}, joint {joint.name!r}"
-    origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, np.float64)
-    kind: Kind = _KINDS.get(joint.type, "fixed")
-    remark = "" if kind != "fixed" or joint.type == "fixed" else f"{joint.type} joint"
-    axis = np.asarray([1, 0, 0] if joint.axis is None else joint.axis, np.float64)
-    length = float(np.linalg.norm(axis))
-    limits = (-np.inf, np.inf)
-    if kind != "fixed":
-        if not np.isfinite(length) or length < 1e-6:
-            raise CaperError(f"{where}: its axis {axis.tolist()} is no direction")
-        axis = axis / length
-    if kind != "fixed" and joint.type != "continuous" and joint.limit is not None:
-        low, high = joint.limit.lower, joint.limit.upper
-        limits = (-np.inf if low is None else low, np.inf if high is None else high)
-        if not limits[0] <= limits[1]:
-            raise CaperError(f"{where}: its limits {limits} are no range")
-        if limits[1] - limits[0] < 1e-6:
-            kind, remark = "fixed", "empty range"
-    mimic = None
-    if kind != "fixed" and joint.mimic is not None:
-        remark = f"mimics {joint.mimic.joint}"
-        multiplier, offset = joint.mimic.multiplier, joint.mimic.offset
-        mimic = (
-            joint.mimic.joint,
-            1.0 if multiplier is None else float(multiplier),
-            0.0 if offset is None else float(offset),
-        )
-    if not (np.isfinite(origin).all() and origin.shape == (4, 4)):
-        raise CaperError(f"{where}: its origin has numbers that are not finite")
-    return UrdfJoint(
-        joint.name, kind, joint.parent, joint.child, origin, axis, limits, remark, mimic
-    )
+def _usable(path: Path, joint: UrdfJoint) -> UrdfJoint:
+    """A joint with its limits checked; fixed where its range is empty."""
+    low, high = joint.limits
+    if not low <= high:
+        raise CaperError(f"{path}, joint {joint.name!r}: its limits {joint.limits} are no range")
+    if high - low < 1e-6:
+        return replace(joint, kind="fixed", remark="empty range", mimic=None)
+    return joint if joint.mimic is None else replace(joint, remark=f"mimics {joint.mimic[0]}")
 
 
 def _root(path: Path, names: list[str], joints: tuple[UrdfJoint, ...]) -> str:
@@ -241,53 +151,6 @@ def _root(path: Path, names: list[str], joints: tuple[UrdfJoint, ...]) -> str:
                 raise CaperError(f"{path}: its joints make a loop through link {name!r}")
             seen.add(name)
     return roots[0]
-
-
-def _link_mesh(path: Path, link: Any, shapes: list[Any]) -> Mesh | None:
-    """All geometry of a link as one mesh in the link's frame."""
-    meshes = []
-    for shape in shapes:
-        where = f"{path}, link {link.name!r}"
-        geometry = shape.geometry
-        if geometry is None:
-            continue
-        if geometry.mesh is not None:
-            file = _resolve(path, geometry.mesh.filename, where)
-            scale = geometry.mesh.scale
-            mesh = read_mesh(file).scaled(1.0 if scale is None else np.asarray(scale, np.float64))
-        else:
-            mesh = primitive_mesh(geometry, where)
-        meshes.append(mesh if shape.origin is None else mesh.moved(np.asarray(shape.origin)))
-    meshes = [mesh for mesh in meshes if len(mesh.faces)]
-    return join(meshes) if meshes else None
-
-
-def _resolve(urdf: Path, filename: str | None, where: str) -> Path:
-    """The file behind a mesh's name.
-
-    ``package://NAME/REST`` is looked for in the folders above the URDF and in ROS_PACKAGE_PATH,
-    with and without NAME: a copied robot often keeps only the inside of its package.
-    """
-    text = (filename or "").replace("\\", "/")
-    scheme, found, rest = text.partition("://")
-    above = urdf.resolve().parents
-    if not found:
-        candidates = [above[0] / text, *(folder / text for folder in above[1:3])]
-    elif scheme == "file":
-        candidates = [Path(rest)]
-    elif scheme in ("package", "model"):
-        inside = rest.partition("/")[2]
-        listed = os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)
-        folders = [*above, *(Path(folder) for folder in listed if folder)]
-        candidates = [folder / rest for folder in folders]
-        candidates += [folder / inside for folder in folders if inside]
-    else:
-        raise CaperError(f"{where}: mesh {filename!r}: only files and package:// are read")
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    looked = "the folders above it and in ROS_PACKAGE_PATH" if found else str(above[0])
-    raise CaperError(f"{where}: mesh {filename!r} is not there (looked in {looked})")
 
 
 def find_models(path: str | Path) -> list[Path]:

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caper_jax.articulation.category import Category
-from caper_jax.data.urdf.load import UrdfJoint, UrdfModel
+from caper_jax.data.urdf.load import UrdfModel
+from caper_jax.data.urdf.xml import UrdfJoint
 from caper_jax.errors import CaperError, unknown_name
 
 # A piece below this share of the smallest wanted part (diagonals) is a button, a key or a wheel.
