@@ -195,14 +195,14 @@ def corners_after_cut(solid: Solid) -> np.ndarray:
     unit, edges = _polytope(solid.kind)
     points = _points(solid, unit)
     assert solid.hole is not None
-    kept = []
+    outside, met = np.zeros(len(points), bool), []
     for normal, offset in zip(*_planes(solid.hole), strict=True):
         height = points @ normal - offset
-        kept.append(points[height >= 0])
-        first, second = edges[(height[edges] >= 0).sum(axis=1) == 1].T
+        outside |= height >= 0
+        first, second = edges[(height[edges[:, 0]] >= 0) != (height[edges[:, 1]] >= 0)].T
         share = height[first] / (height[first] - height[second])
-        kept.append(points[first] + share[:, None] * (points[second] - points[first]))
-    remaining = np.concatenate(kept)
+        met.append(points[first] + share[:, None] * (points[second] - points[first]))
+    remaining = np.concatenate([points[outside], *met])
     if not len(remaining):
         raise CaperError(f"the hole of a {solid.kind} at {solid.center} swallows all of it")
     return remaining
