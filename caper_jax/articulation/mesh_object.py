@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -51,51 +51,46 @@ class MeshObject:
         """The same object with another reference pose; states count from there."""
         poses = self.poses(states)
         carriers = poses[list(self.parents)]
-        return MeshObject(
-            tuple(mesh.moved(pose) for mesh, pose in zip(self.parts, poses, strict=True)),
-            self.kinds,
-            self.parents,
-            np.einsum("jab,jb->ja", carriers[:, :3, :3], self.axis),
-            np.einsum("jab,jb->ja", carriers[:, :3, :3], self.pivot) + carriers[:, :3, 3],
-            self.limits - np.asarray(states)[:, None],
+        turns, shifts = carriers[:, :3, :3], carriers[:, :3, 3]
+        return replace(
+            self,
+            parts=tuple(mesh.moved(pose) for mesh, pose in zip(self.parts, poses, strict=True)),
+            axis=np.einsum("jab,jb->ja", turns, self.axis),
+            pivot=np.einsum("jab,jb->ja", turns, self.pivot) + shifts,
+            limits=self.limits - np.asarray(states)[:, None],
         )
 
     def moved(self, pose: Float[np.ndarray, "4 4"], scale: float = 1.0) -> MeshObject:
         """In another frame (old -> new [4, 4]), then with all lengths times ``scale``."""
         sliding = np.array([kind == "prismatic" for kind in self.kinds], bool)
-        return MeshObject(
-            tuple(mesh.moved(pose).scaled(scale) for mesh in self.parts),
-            self.kinds,
-            self.parents,
-            self.axis @ pose[:3, :3].T,
-            scale * (self.pivot @ pose[:3, :3].T + pose[:3, 3]),
-            self.limits * np.where(sliding, scale, 1.0)[:, None],
+        return replace(
+            self,
+            parts=tuple(mesh.moved(pose).scaled(scale) for mesh in self.parts),
+            axis=self.axis @ pose[:3, :3].T,
+            pivot=scale * (self.pivot @ pose[:3, :3].T + pose[:3, 3]),
+            limits=self.limits * np.where(sliding, scale, 1.0)[:, None],
         )
 
     def flipped(self, signs: Float[np.ndarray, " J"]) -> MeshObject:
         """With the axes of the joints with sign -1 reversed, and their limits with them."""
         limits = np.where(signs[:, None] < 0, -self.limits[:, ::-1], self.limits)
-        return MeshObject(
-            self.parts, self.kinds, self.parents, self.axis * signs[:, None], self.pivot, limits
-        )
+        return replace(self, axis=self.axis * signs[:, None], limits=limits)
 
     def ordered(self, order: Sequence[int]) -> MeshObject:
         """With joint ``order[j]`` as joint j; for joints that all hang on the root."""
         rows = list(order)
-        return MeshObject(
-            (self.parts[0], *(self.parts[row + 1] for row in rows)),
-            tuple(self.kinds[row] for row in rows),
-            self.parents,
-            self.axis[rows],
-            self.pivot[rows],
-            self.limits[rows],
+        return replace(
+            self,
+            parts=(self.parts[0], *(self.parts[row + 1] for row in rows)),
+            kinds=tuple(self.kinds[row] for row in rows),
+            axis=self.axis[rows],
+            pivot=self.pivot[rows],
+            limits=self.limits[rows],
         )
 
     def exchanged(self) -> MeshObject:
         """Two parts, the other one the root: seen from its child, a joint turns the other way."""
-        return MeshObject(
-            self.parts[::-1], self.kinds, self.parents, -self.axis, self.pivot, self.limits
-        )
+        return replace(self, parts=self.parts[::-1], axis=-self.axis)
 
     def bounds(self) -> Float[np.ndarray, "2 3"]:
         """[2, 3] corners of the whole object's box."""
