@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from caper_jax.lie.linalg import transpose
+
 
 def _cube_rotations() -> np.ndarray:
     """[24, 3, 3] signed permutation matrices of determinant one, the identity first."""
@@ -36,11 +38,6 @@ def multiply(
 ) -> Float[Array, "... 3 3"]:
     """Product of rotations in full precision."""
     return jnp.matmul(first, second, precision="highest")
-
-
-def transpose(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Inverse of rotations."""
-    return jnp.swapaxes(rotation, -1, -2)
 
 
 def view_rotation(points: Float[Array, "B N 3"], roll: float = 0.0) -> Float[Array, "B 3 3"]:

@@ -17,10 +17,11 @@ from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.config import NetworkConfig
-from caper_jax.geometry.frames import canonicalize, multiply, rotate, transpose
+from caper_jax.geometry.frames import canonicalize, multiply, rotate
 from caper_jax.geometry.raster_order import from_raster_order, raster_order, to_raster_order
 from caper_jax.geometry.two_axis_rotation import rotation_from_directions
 from caper_jax.lie import se3
+from caper_jax.lie.linalg import transpose
 from caper_jax.models import uncertainty
 from caper_jax.models.encoders import shared_neighborhoods
 from caper_jax.models.parts import PartsNetwork, increment_transform, vote
