@@ -149,10 +149,10 @@ def forward_kinematics(
 
 def joint_transform_float64(
     joint_type: str,
-    axis: Float[np.ndarray, "*batch 3"],
-    pivot: Float[np.ndarray, "*batch 3"],
-    state: float | Shaped[np.ndarray, "*batch"],
-) -> Float[np.ndarray, "*batch 4 4"]:
+    axis: Float[np.ndarray, "*#batch 3"],
+    pivot: Float[np.ndarray, "*#batch 3"],
+    state: float | Shaped[np.ndarray, "*#batch"],
+) -> Float[np.ndarray, "... 4 4"]:
     """``joint_transform`` of a joint with a unit axis, in float64 without JAX.
 
     For files, whose meshes must not move by the rounding of float32.
@@ -182,13 +182,13 @@ def joint_transform_float64(
 
 
 def forward_kinematics_float64(
-    root: Float[np.ndarray, "*batch 4 4"],
-    axis: Float[np.ndarray, "*batch J 3"],
-    pivot: Float[np.ndarray, "*batch J 3"],
-    state: Shaped[np.ndarray, "*batch J"],
+    root: Float[np.ndarray, "*#batch 4 4"],
+    axis: Float[np.ndarray, "*#batch J 3"],
+    pivot: Float[np.ndarray, "*#batch J 3"],
+    state: Shaped[np.ndarray, "*#batch J"],
     joint_types: Sequence[str],
     parents: Sequence[int],
-) -> Float[np.ndarray, "*batch K 4 4"]:
+) -> Float[np.ndarray, "... K 4 4"]:
     """``forward_kinematics`` with unit axes, in float64 without JAX; the same arguments."""
     poses = [np.asarray(root, np.float64)]
     for j, (joint_type, parent) in enumerate(zip(joint_types, parents, strict=True)):
@@ -196,4 +196,4 @@ def forward_kinematics_float64(
             joint_type, axis[..., j, :], pivot[..., j, :], np.asarray(state)[..., j]
         )
         poses.append(poses[parent] @ motion)
-    return np.stack(poses, axis=-3)
+    return np.stack(np.broadcast_arrays(*poses), axis=-3)

@@ -14,7 +14,7 @@ from _helpers.quick import quick_jit
 from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation import kinematics
-from caper_jax.articulation.kinematics import forward_kinematics
+from caper_jax.articulation.kinematics import forward_kinematics, forward_kinematics_float64
 from caper_jax.errors import CaperError
 
 # parents of parts 1, 2, ...: a serial chain, a star, and trees in between
@@ -25,6 +25,10 @@ TREES = {
     "tree": ("rrprpr", (0, 0, 1, 1, 3, 2)),
 }
 STATES = 6
+joint_transform = quick_jit(kinematics.joint_transform, static_argnums=0)
+revolute, prismatic = (
+    quick_jit(f) for f in (kinematics.revolute_transform, kinematics.prismatic_transform)
+)
 
 
 def random_urdf(letters: str, parents: tuple[int, ...], g: np.random.Generator) -> str:
@@ -81,8 +85,7 @@ def test_forward_kinematics_against_urdf(name):
     found = forward(root, axis, pivot, state.astype(np.float32), *tree)
     assert found.shape == (STATES, len(axis) + 1, 4, 4)
     np.testing.assert_allclose(found, root @ expected, atol=2e-5)
-    with jax.enable_x64(True):
-        found = np.asarray(forward(root, axis, pivot, state, *tree))
+    found = forward_kinematics_float64(root, axis, pivot, state, *tree)
     np.testing.assert_allclose(found, root @ expected, atol=1e-12)
 
 
@@ -90,11 +93,11 @@ def test_batches_broadcast_and_map():
     axis, pivot, state, _ = urdf_case("tree")
     tree = types("tree"), TREES["tree"][1]
     state = state.astype(np.float32)
-    whole = quick_jit(lambda s: forward_kinematics(np.eye(4), axis, pivot, s, *tree))(state)
     mapped = quick_jit(jax.vmap(lambda s: forward_kinematics(np.eye(4), axis, pivot, s, *tree)))(
         state
     )
-    np.testing.assert_allclose(whole, mapped, atol=1e-6)
+    whole = forward_kinematics_float64(np.eye(4), axis, pivot, state, *tree)
+    np.testing.assert_allclose(whole, mapped, atol=2e-5)
     shape = jax.eval_shape(
         lambda root: forward_kinematics(root, axis, pivot, state, *tree),
         jax.ShapeDtypeStruct((5, 1, 4, 4), jnp.float32),
@@ -140,9 +143,7 @@ def test_gradients_are_finite_at_every_state(joint_type):
     def value(axis, pivot, state):
         return kinematics.joint_transform(joint_type, axis, pivot, state).sum()
 
-    transform = quick_jit(kinematics.joint_transform, static_argnums=0)(
-        joint_type, axis, np.float32([1, 2, 3]), state
-    )
+    transform = joint_transform(joint_type, axis, np.float32([1, 2, 3]), state)
     assert jnp.isfinite(transform).all()
     np.testing.assert_array_equal(transform[1], np.tile(np.eye(4), (len(state), 1, 1)))
     gradients = quick_jit(jax.grad(value, argnums=(0, 1, 2)))(axis, np.float32([1, 2, 3]), state)
@@ -151,25 +152,25 @@ def test_gradients_are_finite_at_every_state(joint_type):
 
 def test_directions_of_motion():
     # A positive state turns the child by plus the state about the axis, and slides it along.
-    quarter = kinematics.revolute_transform([0.0, 0.0, 2.0], [1.0, 0.0, 5.0], np.pi / 2)
+    vectors = np.float32([[0.0, 0.0, 2.0], [1.0, 0.0, 5.0]])
+    quarter = revolute(*vectors, np.float32(np.pi / 2))
+    quarter = np.asarray(quarter)
     np.testing.assert_allclose(quarter @ np.array([2.0, 0, 0, 1]), [1, 1, 0, 1], atol=1e-6)
     np.testing.assert_allclose(quarter @ np.array([1.0, 0, 7, 1]), [1, 0, 7, 1], atol=1e-6)
-    slid = kinematics.prismatic_transform([0.0, 3.0, 0.0], 0.25)
+    slid = prismatic(np.float32([0.0, 3.0, 0.0]), np.float32(0.25))
     np.testing.assert_array_equal(slid[:3], np.c_[np.eye(3), [0, 0.25, 0]])
 
 
 def test_a_sliding_joint_needs_no_pivot():
-    nowhere = np.full(3, np.nan)
-    slid = kinematics.joint_transform("prismatic", [0.0, 3.0, 0.0], nowhere, 0.25)
-    np.testing.assert_array_equal(slid, kinematics.prismatic_transform([0.0, 3.0, 0.0], 0.25))
+    axis, nowhere = np.float32([0.0, 3.0, 0.0]), np.full(3, np.nan, np.float32)
+    slid = joint_transform("prismatic", axis, nowhere, np.float32(0.25))
+    np.testing.assert_array_equal(slid, prismatic(np.float32([0.0, 3.0, 0.0]), np.float32(0.25)))
 
 
 def test_small_turns_about_far_pivots_keep_their_digits():
     # q - R q would leave the rounding of q: 1e-6 m here, a thousandth of the motion.
-    revolute = quick_jit(kinematics.revolute_transform)
     axis, pivot, angle = np.array([0.0, 0.6, 0.8]), np.array([10.0, -7.0, 3.0]), 1e-4
-    with jax.enable_x64(True):
-        exact = np.asarray(revolute(axis, pivot, angle))
+    exact = kinematics.joint_transform_float64("revolute", axis, pivot, angle)
     found = revolute(*(np.float32(value) for value in (axis, pivot, angle)))
     np.testing.assert_allclose(found[:3, 3], exact[:3, 3], rtol=2e-6)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from caper_jax.articulation.kinematics import forward_kinematics
+from caper_jax.articulation.kinematics import forward_kinematics_float64
 from caper_jax.articulation.pose import ArticulatedPose, joints_in_camera
 
 TYPES, PARENTS = ("revolute", "prismatic", "revolute"), (0, 1, 1)
@@ -23,7 +23,7 @@ def test_axes_are_those_of_the_parents(batch):
     axis, pivot = g.normal(size=(2, *batch, 3, 3))
     axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
     state = g.uniform(-2, 2, (*batch, 3))
-    parts = np.asarray(forward_kinematics(root, axis, pivot, state, TYPES, PARENTS), np.float64)
+    parts = forward_kinematics_float64(root, axis, pivot, state, TYPES, PARENTS)
     nothing = np.zeros((*batch, 4, 3))
     pose = ArticulatedPose(
         rotation=parts[..., :3, :3],
