@@ -9,18 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.pose import ArticulatedPose
 
-# Field of ArticulatedPose, its name in the truth.npz of the ArtImage and PM-Videos samples, and how
-# far a reader may be from what an independent program computed (meters, radians).
-TRUTH_FIELDS = [
-    ("rotation", "R", 1e-5),
-    ("translation", "t", 1e-5),
-    ("size", "size", 1e-4),
-    ("box_center", "box_centre", 1e-4),
-    ("joint_axis", "joint_axis", 1e-5),
-    ("joint_pivot", "joint_pivot", 1e-5),
-    ("joint_state", "joint_state", 1e-5),
-]
-
 
 def random_pose(frames: int, seed: int = 0) -> ArticulatedPose:
     """Poses [F, 2, ...] of an object with one revolute joint, 2.5 m in front of the camera."""

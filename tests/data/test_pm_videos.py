@@ -1,4 +1,4 @@
-"""The PM-Videos reader against ground truth that another program computed from the same files."""
+"""The PM-Videos reader: the order of frames, lines that name them, the part that moves."""
 
 import json
 import shutil
@@ -6,12 +6,10 @@ import shutil
 import numpy as np
 import pytest
 from _helpers import roots
-from _helpers.frames import TRUTH_FIELDS
 
 from caper_jax.data.readers import open_dataset
 from caper_jax.data.readers.artimage import PmVideosDataset
 from caper_jax.data.readers.base import group_videos
-from caper_jax.data.types import validate
 from caper_jax.errors import CaperError
 
 
@@ -20,53 +18,13 @@ def root(shared_data):
     return shared_data / "pm_videos_sample"
 
 
-@pytest.fixture(scope="module")
-def dataset(root):
-    return open_dataset("pm-videos", root, "laptop")
-
-
-@pytest.fixture(scope="module")
-def frames(dataset):
-    return [dataset[i] for i in range(len(dataset))]
-
-
-@pytest.fixture(scope="module")
-def truth(root):
-    with np.load(root / "truth.npz") as file:
-        return {key.partition("/")[2]: file[key] for key in file.files}
-
-
-def test_every_frame_of_every_video(root, dataset, truth):
-    names = [f"{v}/{n}" for v, n in zip(truth["video"], truth["name"], strict=True)]
-    assert list(dataset.names) == names
-    assert dataset.mask_source == "annotated part masks"
-    for official in (False, True):
-        test = open_dataset("pm-videos", root, "laptop", "test", official_split=official)
-        assert list(test.names) == names
-
-
-@pytest.mark.parametrize(("field", "key", "tolerance"), TRUTH_FIELDS)
-def test_ground_truth_agrees_with_an_independent_program(frames, truth, field, key, tolerance):
-    expected = truth[key]
-    # The file's axis is the one about which the child turns by minus the state, in degrees.
-    expected = {"joint_axis": -expected, "joint_state": np.radians(expected)}.get(key, expected)
-    found = np.stack([getattr(frame.truth, field) for frame in frames])
-    np.testing.assert_allclose(found, expected, atol=tolerance, rtol=0)
-
-
-def test_frames_keep_the_conventions(dataset, frames, truth):
-    for frame in frames:
-        validate(frame, dataset.category)
-        assert frame.points.shape == (1024, 3)
-    np.testing.assert_array_equal([frame.visible for frame in frames], truth["pixels"])
-
-
-def test_videos_are_ordered_and_tell_what_moves(dataset, frames):
+def test_videos_are_ordered_and_tell_what_moves(root):
+    dataset = open_dataset("pm-videos", root, "laptop")
     videos = dataset.videos()
     assert videos == {"00000": list(range(30)), "00001": list(range(30, 60))}
     assert {dataset.moving_part(index) for index in (0, 29, 30, 59)} == {1}
     for indices in videos.values():
-        states = [frames[index].truth.joint_state[0] for index in indices]
+        states = [dataset[index].truth.joint_state[0] for index in indices[::6]]
         assert (np.diff(states) > 0).all()
 
 
