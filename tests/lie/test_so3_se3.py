@@ -164,7 +164,7 @@ def functions(xi: jax.Array, change: jax.Array) -> dict[str, jax.Array]:
     return {
         "exp": transform,
         "log": se3.log(se3.compose(se3.exp(xi), jnp.eye(4) + se3.hat(change))),
-        "norm": norm(se3.log(transform)),
+        "norm": norm(xi + change),
         "angle": so3.angle(transform[:3, :3]),
     }
 
