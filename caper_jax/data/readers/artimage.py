@@ -45,7 +45,7 @@ from caper_jax.data.types import Frame
 from caper_jax.errors import CaperError
 
 # A state of the files and the one that the transformations give may differ by this much.
-_STATE_TOLERANCE = {"revolute": np.radians(1.0), "prismatic": 0.01}
+_STATE_TOLERANCE = {"revolute": (1.0, "degrees"), "prismatic": (0.01, "meters")}
 _URDF_ID = re.compile(rb'"urdf_id"\s*:\s*"?([\w.-]+)')
 
 
@@ -130,14 +130,13 @@ class ArtImageDataset(DatasetReader):
             stated = links[j + 1].state
             if stated is None:
                 continue
+            tolerance, unit = _STATE_TOLERANCE[joint.type]
             given = model.signs[j] * float(states[j])
-            difference = (np.radians(stated) if joint.type == "revolute" else stated) - given
+            difference = stated - given
             if joint.type == "revolute":
-                difference = (difference + np.pi) % (2 * np.pi) - np.pi
-            if not abs(difference) <= _STATE_TOLERANCE[joint.type]:
-                unit = "meters"
-                if joint.type == "revolute":
-                    given, unit = np.degrees(given), "degrees"
+                given = np.degrees(given)
+                difference = (stated - given + 180) % 360 - 180
+            if not abs(difference) <= tolerance:
                 raise CaperError(
                     f"{path}: state of link {model.links[j + 1]} is {stated:g}, but its "
                     f"transformation gives {given:.4g} {unit}"
