@@ -10,7 +10,7 @@ import numpy as np
 
 from caper_jax.articulation.conversions import Conversion
 from caper_jax.articulation.urdf_rule import UrdfRule
-from caper_jax.errors import CaperError, unknown_name
+from caper_jax.errors import CaperError, array_problem, unknown_name
 from caper_jax.geometry.solids import Solid
 
 JointType = Literal["revolute", "prismatic"]
@@ -228,13 +228,11 @@ class Category:
             for name, value in left_out(self).items():
                 object.__setattr__(self, name, value)
         for label, rows in (("mean_size", self.mean_size), ("mean_center", self.mean_center)):
-            if np.shape(rows) != (len(self.parts), 3):
+            problem = array_problem(label, rows, (len(self.parts), 3), np.number)
+            if problem:
                 raise CaperError(
-                    f"{where}: {label} must be [{len(self.parts)}, 3]; only a category with a "
-                    "shape function may leave it out"
+                    f"{where}: {problem}; only a category with a shape function may leave it out"
                 )
-            if not np.isfinite(rows).all():
-                raise CaperError(f"{where}: {label} must be finite")
         if not 0 < self.unit < np.inf or np.min(self.mean_size) <= 0:
             raise CaperError(f"{where}: unit and mean_size must be positive")
         if self.closed not in ("low", "high", None):

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from caper_jax.articulation.category import Category, ObjectModel
-from caper_jax.errors import CaperError
+from caper_jax.errors import CaperError, array_problem
 from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.geometry.solids import bounds
 
@@ -68,7 +68,7 @@ def draw_shapes(category: Category, count: int, split: str, seed: int) -> list[O
         model = category.shape(np.random.default_rng([*root, index]))
         problem = _problem(category, model)
         if problem:
-            raise CaperError(f"category {category.name!r}: its shape function gave {problem}")
+            raise CaperError(f"category {category.name!r}: a drawn shape is wrong: {problem}")
         models.append(model)
     return models
 
@@ -76,27 +76,25 @@ def draw_shapes(category: Category, count: int, split: str, seed: int) -> list[O
 def _problem(category: Category, model: Any) -> str | None:
     """What keeps an object from being an instance of a category, or None."""
     if not isinstance(model, ObjectModel):
-        return f"{type(model).__name__}, not an ObjectModel"
+        return f"{type(model).__name__} is no ObjectModel"
     if len(model.parts) != category.num_parts or not all(model.parts):
         solids = ", ".join(str(len(part)) for part in model.parts)
-        return f"parts of {solids} solids; each of {', '.join(category.parts)} needs one or more"
+        return f"parts have {solids} solids; each of {', '.join(category.parts)} needs one or more"
     count = category.num_joints
     for name, columns in (("axis", 3), ("pivot", 3), ("limits", 2)):
-        values = np.asarray(getattr(model, name), np.float64)
-        if values.shape != (count, columns):
-            return f"{name} of shape {values.shape}, not {(count, columns)}"
-        if not np.isfinite(values).all():
-            return f"{name} that is not finite: {values.tolist()}"
+        problem = array_problem(name, getattr(model, name), (count, columns), np.number)
+        if problem:
+            return problem
     lengths = np.linalg.norm(model.axis, axis=-1)
     for part, joint, length, (low, high) in zip(
         category.parts[1:], category.joints, lengths, model.limits, strict=True
     ):
         if abs(length - 1) > 1e-3:
-            return f"the joint of {part!r} an axis of length {length:.4g}, not 1"
+            return f"the joint of {part!r} has an axis of length {length:.4g}, not 1"
         if low > high:
-            return f"the joint of {part!r} limits that are no range: {low:.4g} to {high:.4g}"
+            return f"the joint of {part!r} has limits that are no range: {low:.4g} to {high:.4g}"
         if joint.type == "revolute" and max(abs(low), abs(high)) > _LARGEST_ANGLE:
-            return f"the joint of {part!r} limits {low:.4g} to {high:.4g}; they are radians"
+            return f"the joint of {part!r} has limits {low:.4g} to {high:.4g}; they are radians"
     return None
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
 
 from caper_jax.data.images import read_array
-from caper_jax.errors import CaperError
+from caper_jax.errors import CaperError, checked_array
 from caper_jax.geometry.raster_order import raster_order
 
 MIN_POINTS = 16
@@ -161,9 +161,7 @@ def back_project(
     rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray
 ) -> Float32[np.ndarray, "*batch 3"]:
     """[..., 3] float32 camera points of pixels (row v, column u) at ``depth``, meters."""
-    intrinsics = np.asarray(intrinsics, np.float64)
-    if intrinsics.shape != (3, 3):
-        raise CaperError(f"intrinsics must be [3, 3], got {intrinsics.shape}")
+    intrinsics = checked_array("intrinsics", intrinsics, (3, 3)).astype(np.float64)
     x = (columns - intrinsics[0, 2]) / intrinsics[0, 0] * depth
     y = (rows - intrinsics[1, 2]) / intrinsics[1, 1] * depth
     return np.stack([x, y, depth], axis=-1).astype(np.float32)

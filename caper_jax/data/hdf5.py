@@ -20,8 +20,8 @@ from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.images import check_values
 from caper_jax.data.readers.base import DatasetReader, Schema
-from caper_jax.data.types import Frame, array_problem, pose_problems, pose_shapes
-from caper_jax.errors import CaperError
+from caper_jax.data.types import Frame, pose_problems, pose_shapes
+from caper_jax.errors import CaperError, array_problem
 
 FORMAT = "caper"
 FORMAT_VERSION = 1

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int, Int32
 
 from caper_jax.articulation.kinematics import forward_kinematics_float64
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.errors import CaperError
+from caper_jax.errors import CaperError, array_problem, first_entry
 
 if TYPE_CHECKING:
     from caper_jax.articulation.category import Category
@@ -112,70 +112,6 @@ class Dataset(Protocol):
         ...
 
 
-def array_problem(
-    name: str,
-    value: Any,
-    shape: tuple[int | None, ...],
-    dtype: type = np.floating,
-    low: float = -np.inf,
-    high: float = np.inf,
-) -> str | None:
-    """What is wrong with an array from outside, as a phrase that begins with its name, or None.
-
-    Args:
-      name: of the array or field.
-      value: anything that numpy takes for an array.
-      shape: what its shape must be; None stands for any length but 0.
-      dtype: its dtype, or an abstract one such as ``np.integer``.
-      low, high: range of its entries, ends included; none may be NaN or infinite in any case.
-    """
-    try:
-        array = np.asarray(value)
-    except ValueError:  # rows of different length
-        return f"{name} must be an array of shape {_shape_text(shape)}"
-    if array.ndim != len(shape) or any(
-        length != known if known is not None else length == 0
-        for known, length in zip(shape, array.shape, strict=True)
-    ):
-        return f"{name} has shape {array.shape}, expected {_shape_text(shape)}"
-    if not np.issubdtype(array.dtype, dtype):
-        return f"{name} is {array.dtype}, expected {dtype.__name__}"
-    if array.dtype.kind in "fc" and not np.isfinite(array).all():
-        return f"{name} has NaN or infinite entries{_first(~np.isfinite(array))}"
-    outside = (array < low) | (array > high)
-    if outside.any():
-        worst = array[tuple(np.argwhere(outside)[0])]
-        limits = f"at least {low:g}" if high == np.inf else f"from {low:g} to {high:g}"
-        return f"{name} must be {limits}, got {worst}{_first(outside)}"
-    return None
-
-
-def checked_array(
-    where: str,
-    value: Any,
-    shape: tuple[int | None, ...],
-    dtype: type = np.number,
-    low: float = -np.inf,
-    high: float = np.inf,
-) -> np.ndarray:
-    """An array from outside; CaperError, which begins with ``where``, for a wrong one."""
-    problem = array_problem(where, value, shape, dtype, low, high)
-    if problem:
-        raise CaperError(problem)
-    return np.asarray(value)
-
-
-def finite_array(value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Float64 numbers of a shape from (nested lists of) numbers; ValueError for anything else."""
-    try:
-        array = np.asarray(value, np.float64).reshape(shape)
-    except (TypeError, ValueError, OverflowError):
-        array = np.full(1, np.nan)
-    if not np.isfinite(array).all():
-        raise ValueError(f"must be {' x '.join(map(str, shape))} finite numbers")
-    return array
-
-
 def pose_shapes(num_parts: int) -> dict[str, tuple[int, ...]]:
     """Shape of every field of an unbatched ``ArticulatedPose`` with ``num_parts`` parts."""
     joints = num_parts - 1
@@ -241,17 +177,18 @@ def pose_problems(pose: ArticulatedPose, category: Category) -> list[str]:
     if (drift > _ROTATION_TOLERANCE).any():
         problems.append(
             f"rotation is not orthonormal (off by {drift.max():.2g})"
-            f"{_first(drift > _ROTATION_TOLERANCE)}: divide a scaled matrix by its scale"
+            f"{first_entry(drift > _ROTATION_TOLERANCE)}: divide a scaled matrix by its scale"
         )
     elif mirrored.any():
-        problems.append(f"rotation is a reflection (determinant -1){_first(mirrored)}")
+        problems.append(f"rotation is a reflection (determinant -1){first_entry(mirrored)}")
     if (double["size"] <= 0).any():
-        problems.append(f"size must be positive{_first(double['size'] <= 0)}")
+        problems.append(f"size must be positive{first_entry(double['size'] <= 0)}")
     for key in ("translation", "size", "box_center", "joint_pivot"):
         problems += _far_problems(key, double[key])
     slant = np.abs(np.linalg.norm(double["joint_axis"], axis=-1) - 1)
-    if (slant > _ROTATION_TOLERANCE).any():
-        problems.append(f"joint_axis is not a unit vector{_first(slant > _ROTATION_TOLERANCE)}")
+    slanted = slant > _ROTATION_TOLERANCE
+    if slanted.any():
+        problems.append(f"joint_axis is not a unit vector{first_entry(slanted)}")
     if not problems:
         problems += _kinematics_problems(double, category)
     return problems
@@ -282,8 +219,8 @@ def _kinematics_problems(arrays: dict[str, np.ndarray], category: Category) -> l
     part = category.parts[int(np.argwhere(apart)[0][-1])]
     return [
         f"pose of part {part!r} is not the one its joint and state give (worst "
-        f"{np.degrees(chord.max()):.2g} deg, {distance.max():.2g} m){_first(apart)}: check the "
-        "sign and unit of joint_state, and that axis and pivot are in the root's rest frame"
+        f"{np.degrees(chord.max()):.2g} deg, {distance.max():.2g} m){first_entry(apart)}: check "
+        "the sign and unit of joint_state, and that axis and pivot are in the root's rest frame"
     ]
 
 
@@ -301,15 +238,3 @@ def _cloud_problems(frame: Frame, num_parts: int) -> list[str]:
         problem = None if value is None else array_problem(name, value, *arguments)
         problems += [problem] if problem else []
     return problems
-
-
-def _shape_text(shape: tuple[int | None, ...]) -> str:
-    """(N, 3) for (None, 3)."""
-    axes = ["N" if length is None else str(length) for length in shape]
-    return f"({', '.join(axes)}{',' if len(axes) == 1 else ''})"
-
-
-def _first(bad: np.ndarray) -> str:
-    """Where the first true entry is, as " at [i, j]"; nothing for a scalar."""
-    index = np.argwhere(bad)[0]
-    return f" at {index.tolist()}" if index.size else ""

@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from caper_jax.errors import CaperError
+from caper_jax.errors import CaperError, checked_array
 
 Kind = Literal["box", "cylinder", "ellipsoid", "frustum", "cone"]
 TAPERED: tuple[Kind, ...] = ("frustum", "cone")
@@ -138,8 +138,7 @@ def _solid(kind: Kind, center, half, rotation, hole, taper=(1.0, 1.0)) -> Solid:
         ("half", half, (3,)),
         ("rotation", rotation, (3, 3)),
     ):
-        if value.shape != shape or not np.isfinite(value).all():
-            raise CaperError(f"{kind}: {name} must be finite numbers of shape {shape}, got {value}")
+        checked_array(f"{kind}: {name}", value, shape)
     if not (half > 0).all():
         raise CaperError(f"{kind}: half extents must be positive, got {half}")
     return Solid(kind, center, half, rotation, hole, taper)

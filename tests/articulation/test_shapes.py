@@ -62,14 +62,14 @@ def test_placeholders_are_named_with_what_was_drawn(wrong, named):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        (lambda model: replace(model, axis=2 * model.axis), "'door' an axis of length 2"),
+        (lambda model: replace(model, axis=2 * model.axis), "'door' has an axis of length 2"),
         (lambda model: replace(model, limits=np.degrees(model.limits)), "radians"),
         (lambda model: replace(model, limits=model.limits[:, ::-1]), "no range"),
         (lambda model: replace(model, parts=model.parts[:1]), "body, door"),
         (lambda model: replace(model, parts=[model.parts[0], []]), "body, door"),
-        (lambda model: replace(model, pivot=np.zeros(3)), r"pivot of shape \(3,\)"),
-        (lambda model: replace(model, axis=np.full((1, 3), np.nan)), "axis that is not finite"),
-        (lambda model: model.parts, "list, not an ObjectModel"),
+        (lambda model: replace(model, pivot=np.zeros(3)), r"pivot has shape \(3,\)"),
+        (lambda model: replace(model, axis=np.full((1, 3), np.nan)), "axis has NaN"),
+        (lambda model: model.parts, "list is no ObjectModel"),
     ],
 )
 def test_objects_that_are_no_instance_are_explained(change, named):

@@ -19,12 +19,13 @@ from pydantic import (
 from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.category import Category
+from caper_jax.articulation.conversions import AxisMap, RestObject, StoredObject
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.clouds import MIN_POINTS, cloud_from_depth
 from caper_jax.data.images import check_values
 from caper_jax.data.readers.base import Schema
-from caper_jax.data.types import Frame, finite_array
-from caper_jax.errors import CaperError
+from caper_jax.data.types import Frame
+from caper_jax.errors import CaperError, finite_array
 
 _SCALE_TOLERANCE = 1e-3
 
@@ -138,6 +139,40 @@ class Model:
     pivot: np.ndarray
     links: tuple[int, ...]
     signs: np.ndarray
+
+    @classmethod
+    def of_rest(
+        cls,
+        rest: RestObject | StoredObject,
+        poses: np.ndarray,
+        axes: AxisMap,
+        size: np.ndarray,
+        center: np.ndarray,
+    ) -> Model:
+        """From an object at rest in the file's frame; the origin is the middle of all boxes.
+
+        Args:
+          rest: gives the joints.
+          poses: [K, 4, 4] links' own frames -> the file's frame, at rest.
+          axes: how the file's frame, parts and joints become ours.
+          size, center: [K, 3] boxes of our parts along our axes, before the origin is moved.
+        """
+        rotation, order = axes.rotation, list(axes.order)
+        joints = np.array(order[1:], int) - 1
+        origin = ((center - size / 2).min(0) + (center + size / 2).max(0)) / 2
+        # p_file = R_rest^T (A^T (p_ours + origin) - t_rest)
+        back = poses[order, :3, :3].swapaxes(-1, -2)
+        shift = rotation.T @ origin - poses[order, :3, 3]
+        return cls(
+            to_file_rotation=back @ rotation.T,
+            to_file_shift=np.einsum("kij,kj->ki", back, shift),
+            size=size,
+            center=center - origin,
+            axis=axes.signs[:, None] * (rest.axis[joints] @ rotation.T),
+            pivot=rest.pivot[joints] @ rotation.T - origin,
+            links=axes.order,
+            signs=axes.signs,
+        )
 
 
 def ordered_links(

@@ -26,7 +26,6 @@ is assumed, not verified. Objects of a category without a conversion are taken t
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -153,32 +152,17 @@ def canonical_axes(rest: RestObject, category: Category, rule, where: str) -> Ax
     return AxisMap(rotation, tuple(order.tolist()), np.sign(cosines))
 
 
-def rest_model(rest: RestObject, poses: Sequence[np.ndarray] | np.ndarray, axes: AxisMap) -> Model:
-    """The model of an object whose axes are known.
+def rest_model(rest: RestObject, poses: np.ndarray, axes: AxisMap) -> Model:
+    """The model of an object whose axes are known, with the boxes of its points.
 
     Args:
       rest: the object at rest, in the file's frame.
-      poses: K [4, 4], the links' own frames -> that frame, at rest.
+      poses: [K, 4, 4] the links' own frames -> that frame, at rest.
       axes: how it becomes ours.
     """
-    rotation, order = axes.rotation, list(axes.order)
-    joints = np.array(order[1:], int) - 1
-    boxes = [rest.points[link] @ rotation.T for link in order]
+    boxes = [rest.points[link] @ axes.rotation.T for link in axes.order]
     low, high = np.array([b.min(0) for b in boxes]), np.array([b.max(0) for b in boxes])
-    origin = (low.min(0) + high.max(0)) / 2
-    # p_raw = R_rest^T (A^T (p_ours + origin) - t_rest)
-    back = [poses[link][:3, :3].T for link in order]
-    shift = [rotation.T @ origin - poses[link][:3, 3] for link in order]
-    return Model(
-        to_file_rotation=np.stack([b @ rotation.T for b in back]),
-        to_file_shift=np.stack([b @ s for b, s in zip(back, shift, strict=True)]),
-        size=high - low,
-        center=(low + high) / 2 - origin,
-        axis=axes.signs[:, None] * (rest.axis[joints] @ rotation.T),
-        pivot=rest.pivot[joints] @ rotation.T - origin,
-        links=axes.order,
-        signs=axes.signs,
-    )
+    return Model.of_rest(rest, poses, axes, high - low, (low + high) / 2)
 
 
 def moving_joints(path: Path, pattern: str) -> list[UrdfJoint]:

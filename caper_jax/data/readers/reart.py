@@ -39,7 +39,7 @@ from pydantic import PlainValidator
 
 from caper_jax import categories
 from caper_jax.articulation.category import Category
-from caper_jax.articulation.conversions import ReArtConversion, StoredObject
+from caper_jax.articulation.conversions import AxisMap, ReArtConversion, StoredObject
 from caper_jax.articulation.kinematics import forward_kinematics_float64
 from caper_jax.data import safe_pickle
 from caper_jax.data.images import check_values, read_depth, read_json_as
@@ -57,8 +57,8 @@ from caper_jax.data.readers.annotations import (
 from caper_jax.data.readers.artimage import SingleAnnotation, object_named_in
 from caper_jax.data.readers.artimage_models import ALIGNED, moving_joints
 from caper_jax.data.readers.base import ALL, DatasetReader, Schema, in_natural_order, read_list
-from caper_jax.data.types import Frame, checked_array, finite_array
-from caper_jax.errors import CaperError
+from caper_jax.data.types import Frame
+from caper_jax.errors import CaperError, checked_array, finite_array
 
 _CATEGORY_ID = re.compile(rb'"category_id"\s*:\s*(\d+)')
 # A joint is named base_link_link1_joint or base|revolute|link1.
@@ -349,21 +349,8 @@ def rest_model(meta: _Meta, category: Category, conversion: ReArtConversion, whe
         size = (np.abs(axes @ rest[:, :3, :3]) @ extents[..., None])[..., 0]
     if np.min(size) <= 0:
         raise CaperError(f"{where}: no closed {category.name} has the boxes {extents.tolist()}")
-    origin = ((center - size / 2).min(0) + (center + size / 2).max(0)) / 2
-
-    # p_file = R_rest^T (A^T (p_ours + origin) - t_rest)
-    back = rest[:, :3, :3].swapaxes(-1, -2)
-    shift = axes.T @ origin - rest[:, :3, 3]
-    return Model(
-        to_file_rotation=back @ axes.T,
-        to_file_shift=np.einsum("kij,kj->ki", back, shift),
-        size=size,
-        center=center - origin,
-        axis=stored.axis @ axes.T,
-        pivot=stored.pivot @ axes.T - origin,
-        links=tuple(range(category.num_parts)),
-        signs=np.ones(category.num_joints),
-    )
+    axis_map = AxisMap(axes, tuple(range(category.num_parts)), np.ones(category.num_joints))
+    return Model.of_rest(stored, rest, axis_map, size, center)
 
 
 def _stored_object(
