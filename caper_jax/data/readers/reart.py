@@ -106,6 +106,7 @@ class _ReArtReader(DatasetReader):
 
     mask_source = "annotated polygons"
     family = "reart"
+    depth_folder: Path
 
     def frame_of(
         self, name: str, annotation: Annotation, instance: Instance, path: Path, where: str
@@ -121,19 +122,8 @@ class _ReArtReader(DatasetReader):
         depth = read_depth(depth_path)
         check_image_size(depth_path, depth, annotation, path)
         labels = polygon_labels(links, depth.shape)
-        return labeled_frame(
-            name,
-            depth,
-            labels,
-            self.intrinsics_for(depth),
-            truth,
-            self.num_points,
-            instance.urdf_id,
-        )
-
-    @property
-    def depth_folder(self) -> Path:
-        raise NotImplementedError
+        camera = self.intrinsics_for(depth)
+        return labeled_frame(name, depth, labels, camera, truth, self.num_points, instance.urdf_id)
 
 
 class ReArtMixDataset(_ReArtReader):
@@ -165,11 +155,8 @@ class ReArtMixDataset(_ReArtReader):
     def split_folder(cls, root: Path, category: Category) -> Path:
         return root  # lists of all categories together
 
-    @property
-    def depth_folder(self) -> Path:
-        return self.root / "depth"
-
     def open(self) -> None:
+        self.depth_folder = self.root / "depth"
         for name in ("annotations", "depth"):
             self.need_folder(self.root / name)
         self.use_camera(self.root / "camera_intrinsic.json")
@@ -261,11 +248,8 @@ class ReArtVideosDataset(_ReArtReader):
     def _folder(cls, category: Category) -> str:
         return cls.conversion_of(category).names[0]
 
-    @property
-    def depth_folder(self) -> Path:
-        return self.root / "Data" / "depth"
-
     def open(self) -> None:
+        self.depth_folder = self.root / "Data" / "depth"
         self._annotations = self.root / "Data" / "new_anno_test" / self._folder(self.category)
         self.need_folder(self._annotations)
         self.use_camera(self.root / "Data" / "camera_intrinsic.json")
