@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -197,17 +196,7 @@ def read_json(path: str | Path) -> Any:
       CaperError: missing file, broken JSON, with line and column, or content beyond what Python
         reads (thousands of brackets in each other, or of digits).
     """
-    path = _file(path)
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise CaperError(
-            f"{path}: broken JSON at line {error.lineno}, column {error.colno}: {error.msg}"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise CaperError(f"{path}: not a JSON text file ({error.reason})") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise CaperError(f"{path}: cannot be read as JSON ({error})") from error
+    return read_json_as(path, cast(Any, Any))
 
 
 def read_json_as(path: str | Path, schema: type[Schema]) -> Schema:
