@@ -194,11 +194,14 @@ def corners_after_cut(solid: Solid) -> np.ndarray:
     unit, edges = _polytope(solid.kind)
     points = _points(solid, unit)
     assert solid.hole is not None
+    starts, ends = edges.T.copy()
     outside, met = np.zeros(len(points), bool), []
     for normal, offset in zip(*_planes(solid.hole), strict=True):
         height = points @ normal - offset
-        outside |= height >= 0
-        first, second = edges[(height[edges[:, 0]] >= 0) != (height[edges[:, 1]] >= 0)].T
+        beyond = height >= 0
+        outside |= beyond
+        crossing = beyond[starts] != beyond[ends]
+        first, second = starts[crossing], ends[crossing]
         share = height[first] / (height[first] - height[second])
         met.append(points[first] + share[:, None] * (points[second] - points[first]))
     remaining = np.concatenate([points[outside], *met])
