@@ -120,17 +120,12 @@ def set_transformation(value):
         (lambda a: a["instances"][0].update(urdf_id=77), "no object 77"),
         (lambda a: links(a).pop(), r"000000\.json: link_category_id must be 0 to 1"),
         (lambda a: links(a)[0].pop("transformation"), "link 0: transformation is missing"),
-        (lambda a: links(a)[0].pop("link_category_id"), "link 0: link_category_id is missing"),
         (set_transformation(np.diag([1, 1, -1, 1]).tolist()), "determinant -1"),
         (set_transformation(np.diag([2, 2, 2, 1]).tolist()), "must carry no scale"),
-        (set_transformation([[1, 2], [3]]), "transformation must be 4 x 4"),
         (lambda a: links(a)[1].update(state=0.1297), "state of link 1 is 0.1297, but .* 7.432 deg"),
-        (lambda a: links(a)[1].update(state="open"), "link 1: state .* got 'open'"),
         (lambda a: a.update(depth_path="depth/000009.png"), r"000009\.png: no such file"),
-        (lambda a: a.update(depth_path=3), r"000000\.json: depth_path .* got 3"),
         (lambda a: a.update(width=320), "640 x 640, but .* width 320"),
         (lambda a: a["instances"].append(a["instances"][0]), r"000000\.json: instances .* 1 item"),
-        (lambda a: a["instances"][0].pop("links"), "instances.0.links is missing"),
     ],
 )
 def test_bad_annotations_are_named(root, tmp_path, edit, message):
