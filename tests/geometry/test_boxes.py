@@ -29,6 +29,9 @@ KINDS = {
 }
 
 
+iou = jax.jit(boxes.iou_full)  # compiled once per shape and precision, as it ships
+
+
 def pairs(kind: str, count: int = 30) -> tuple[np.ndarray, ...]:
     """Rotation, center and size of a, then of b: [count, 3, 3], [count, 3], [count, 3]."""
     g = np.random.default_rng(list(KINDS).index(kind))
@@ -101,7 +104,6 @@ def test_iou_against_scipy(kind):
     case = pairs(kind)
     reference = np.array([scipy_iou(*row) for row in zip(*case, strict=True)])
     rounded = [array.astype(np.float32) for array in case]
-    iou = jax.jit(boxes.iou_full)
     in_single = iou(*rounded)
     assert in_single.dtype == jnp.float32
     with jax.enable_x64(True):
@@ -121,8 +123,9 @@ def test_axis_aligned_integer_boxes_are_exact():
     common = np.maximum(high - low, 0).prod(axis=1)
     expected = common / (sizes.prod(axis=2).sum(axis=0) - common)
     assert (common == 0).any() and ((high == low).any(axis=1)).any()  # apart, and touching
-    iou = jax.jit(boxes.iou_full)(np.eye(3), centers[0], sizes[0], np.eye(3), centers[1], sizes[1])
-    np.testing.assert_allclose(iou, expected, rtol=0, atol=1e-6)
+    one, other = ((np.eye(3), center, size) for center, size in zip(centers, sizes, strict=True))
+    found = quick_jit(boxes.iou_full)(*one, *other)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
 def test_symmetric_and_independent_of_the_frame():
@@ -133,10 +136,11 @@ def test_symmetric_and_independent_of_the_frame():
         for rotation, center, size in (a, b)
     ]
     with jax.enable_x64(True):
-        plain = boxes.iou_full(*a, *b)
-        np.testing.assert_allclose(boxes.iou_full(*b, *a), plain, atol=1e-12)
-        np.testing.assert_allclose(boxes.iou_full(*moved[0], *moved[1]), plain, atol=1e-12)
-        np.testing.assert_allclose(jax.vmap(boxes.iou_full)(*a, *b), plain, atol=1e-12)
+        plain = iou(*a, *b)
+        np.testing.assert_allclose(iou(*b, *a), plain, atol=1e-12)
+        np.testing.assert_allclose(iou(*moved[0], *moved[1]), plain, atol=1e-12)
+        mapped = quick_jit(jax.vmap(boxes.iou_full))(*a, *b)
+        np.testing.assert_allclose(mapped, plain, atol=1e-12)
 
 
 gradients = quick_jit(jax.grad(lambda *case: boxes.iou_full(*case).sum(), argnums=tuple(range(6))))
@@ -149,7 +153,7 @@ def test_degenerate_boxes_give_zero():
             size[row_of, 1] = bad
         case[2][3 * row + 2, 1] = case[5][3 * row + 2, 1] = bad
     case[0][12, 0, 0] = case[1][13, 0] = case[4][14, 0] = np.nan
-    np.testing.assert_array_equal(np.asarray(boxes.iou_full(*case)[:15]), 0)
+    np.testing.assert_array_equal(np.asarray(iou(*case)[:15]), 0)
     np.testing.assert_array_equal(np.asarray(boxes.iou_size(case[2], case[5])[:12]), 0)
     for gradient in gradients(*case):
         np.testing.assert_array_equal(gradient[:15], 0)
