@@ -8,9 +8,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from caper_jax.arrays import array_problem
 from caper_jax.articulation.conversions import Conversion
 from caper_jax.articulation.urdf_rule import UrdfRule
-from caper_jax.errors import CaperError, array_problem, unknown_name
+from caper_jax.errors import CaperError, unknown_name
 from caper_jax.geometry.solids import Solid
 
 JointType = Literal["revolute", "prismatic"]

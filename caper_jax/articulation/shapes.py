@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from caper_jax.arrays import array_problem
 from caper_jax.articulation.category import Category, ObjectModel
-from caper_jax.errors import CaperError, array_problem
+from caper_jax.errors import CaperError
 from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.geometry.solids import bounds
 

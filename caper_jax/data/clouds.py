@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
 
+from caper_jax.arrays import checked_array
 from caper_jax.data.images import read_array
-from caper_jax.errors import CaperError, checked_array
+from caper_jax.errors import CaperError
 from caper_jax.geometry.raster_order import raster_order
 
 MIN_POINTS = 16

@@ -16,12 +16,13 @@ import h5py
 import numpy as np
 
 from caper_jax import categories
+from caper_jax.arrays import array_problem
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.images import check_values
 from caper_jax.data.readers.base import DatasetReader, Schema
 from caper_jax.data.types import Frame, pose_problems, pose_shapes
-from caper_jax.errors import CaperError, array_problem
+from caper_jax.errors import CaperError
 
 FORMAT = "caper"
 FORMAT_VERSION = 1

@@ -10,9 +10,10 @@ import flax.struct
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int32
 
+from caper_jax.arrays import array_problem, first_entry
 from caper_jax.articulation.kinematics import forward_kinematics_float64
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.errors import CaperError, array_problem, first_entry
+from caper_jax.errors import CaperError
 
 if TYPE_CHECKING:
     from caper_jax.articulation.category import Category

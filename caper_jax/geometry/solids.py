@@ -19,7 +19,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from caper_jax.errors import CaperError, checked_array
+from caper_jax.arrays import checked_array
+from caper_jax.errors import CaperError
 
 Kind = Literal["box", "cylinder", "ellipsoid", "frustum", "cone"]
 TAPERED: tuple[Kind, ...] = ("frustum", "cone")

@@ -18,6 +18,7 @@ from pydantic import (
 )
 from scipy.spatial.transform import Rotation
 
+from caper_jax.arrays import finite_array
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.conversions import AxisMap, RestObject, StoredObject
 from caper_jax.articulation.pose import ArticulatedPose
@@ -25,7 +26,7 @@ from caper_jax.data.clouds import MIN_POINTS, cloud_from_depth
 from caper_jax.data.images import check_values
 from caper_jax.data.readers.base import Schema
 from caper_jax.data.types import Frame
-from caper_jax.errors import CaperError, finite_array
+from caper_jax.errors import CaperError
 
 _SCALE_TOLERANCE = 1e-3
 

@@ -38,6 +38,7 @@ from pydantic import PlainValidator
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
+from caper_jax.arrays import checked_array, finite_array
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.conversions import AxisMap, CaptraConversion, RestObject
 from caper_jax.articulation.mesh_object import MeshObject
@@ -53,7 +54,7 @@ from caper_jax.data.readers.artimage_models import canonical_axes, rest_model
 from caper_jax.data.readers.base import ALL, DatasetReader, Schema, group_videos, in_natural_order
 from caper_jax.data.types import Frame
 from caper_jax.data.urdf.xml import UrdfJoint, number_of, parse_urdf, read_joints, read_shapes
-from caper_jax.errors import CaperError, checked_array, finite_array, unknown_name
+from caper_jax.errors import CaperError, unknown_name
 from caper_jax.geometry.meshes import Mesh, join
 
 _PLACES = {"train": "render", "test": "render_seq"}

@@ -38,6 +38,7 @@ from annotated_types import Len
 from pydantic import PlainValidator
 
 from caper_jax import categories
+from caper_jax.arrays import checked_array, finite_array
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.conversions import AxisMap, ReArtConversion, StoredObject
 from caper_jax.articulation.kinematics import forward_kinematics_float64
@@ -58,7 +59,7 @@ from caper_jax.data.readers.artimage import SingleAnnotation, object_named_in
 from caper_jax.data.readers.artimage_models import ALIGNED, moving_joints
 from caper_jax.data.readers.base import ALL, DatasetReader, Schema, in_natural_order, read_list
 from caper_jax.data.types import Frame
-from caper_jax.errors import CaperError, checked_array, finite_array
+from caper_jax.errors import CaperError
 
 _CATEGORY_ID = re.compile(rb'"category_id"\s*:\s*(\d+)')
 # A joint is named base_link_link1_joint or base|revolute|link1.

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from caper_jax.errors import CaperError, finite_array
+from caper_jax.arrays import finite_array
+from caper_jax.errors import CaperError
 from caper_jax.geometry.meshes import Mesh, primitive_mesh, read_mesh
 
 Kind = Literal["revolute", "prismatic", "fixed"]
