@@ -25,22 +25,16 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Chain:
-    """A serial chain of seven links in its rest pose, standing on the floor (y = 0) at the origin.
+    """A serial chain of seven links in its rest pose, on the floor (y = 0) at the origin."""
 
-    Attributes:
-      paths: of each link [n, 3] points, meters: path k begins on joint k (path 0 on the floor) and
-        ends where joint k + 1 is.
-      axes: of the six joints, the letter of the positive canonical axis each turns about at rest.
-      limits: [6, 2] degrees from the rest pose.
-      tip: [3] unit direction that the flange faces.
-      radius: half the thickness of the lowest link, meters.
-    """
-
+    # Of each link [n, 3] points, meters: path k begins on joint k (path 0 on the floor) and ends
+    # where joint k + 1 is.
     paths: tuple[np.ndarray, ...]
+    # Of the six joints, the letter of the positive canonical axis each turns about at rest.
     axes: str
-    limits: np.ndarray
-    tip: np.ndarray
-    radius: float
+    limits: np.ndarray  # [6, 2] degrees from the rest pose
+    tip: np.ndarray  # [3] unit direction that the flange faces
+    radius: float  # half the thickness of the lowest link, meters
 
 
 def _chain(paths: list[list[Point]], axes: str, limits, tip: Point, radius: float) -> Chain:
