@@ -8,13 +8,7 @@ import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry
 from caper_jax.articulation.conversions import ReArtConversion
-from caper_jax.articulation.urdf_rule import (
-    UrdfRule,
-    X,
-    closed_states,
-    hinged_axes,
-    opens_along,
-)
+from caper_jax.articulation.urdf_rule import UrdfRule, X, closed_states, hinged_axes, opens_along
 from caper_jax.categories.forms import TURN_X, TURN_Y, UPSIDE_DOWN, open_box
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid, frustum
 

@@ -11,18 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from caper_jax.articulation import urdf_rule as urdf
 from caper_jax.articulation.category import Category, Joint, ObjectModel
 from caper_jax.articulation.conversions import ReArtConversion, StoredObject
 from caper_jax.articulation.mesh_object import MeshObject
-from caper_jax.articulation.urdf_rule import (
-    CanonicalAxes,
-    UrdfRule,
-    X,
-    along_positive,
-    closed_states,
-    opening_sign,
-    opens_along,
-)
 from caper_jax.categories.forms import TURN_X, TURN_Y, UP, along, beam
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid
 
@@ -303,7 +295,7 @@ def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
     The face is where the blade, with its slider, clearly stands out of the handle; of a cutter
     without such a slider, the face across the handle's thin direction.
     """
-    travel = ref.axis[0] * opening_sign(ref, 0)
+    travel = ref.axis[0] * urdf.opening_sign(ref, 0)
 
     def shift(direction: np.ndarray) -> float:
         """Of the blade's middle from the handle's, as a share of the handle."""
@@ -318,8 +310,8 @@ def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
         second = across @ ref.parts[0].moments()[2] @ across
         # The travel itself has the value 0; the thin direction comes next.
         up = np.linalg.eigh(second)[1][:, 1]
-    up = up * np.sign(shift(up)) if abs(shift(up)) > 0.05 else along_positive(up)
-    return CanonicalAxes(up, np.cross(travel, up))
+    up = up * np.sign(shift(up)) if abs(shift(up)) > 0.05 else urdf.along_positive(up)
+    return urdf.CanonicalAxes(up, np.cross(travel, up))
 
 
 def _stored_extension(stored: StoredObject) -> float:
@@ -341,10 +333,10 @@ CUTTER = Category(
     mean_size=((0.141, 0.015, 0.029), (0.114, 0.013, 0.017)),
     mean_center=((0.0, -0.002, 0.0), (0.012, 0.003, 0.0)),
     shape=shape,
-    urdf_rule=UrdfRule(
-        rest=closed_states,
+    urdf_rule=urdf.UrdfRule(
+        rest=urdf.closed_states,
         axes=_urdf_axes,
-        opening=opens_along(X),
+        opening=urdf.opens_along(urdf.X),
         partnet_classes=("Knife",),
     ),
     datasets={

@@ -6,18 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from caper_jax.articulation import urdf_rule as urdf
 from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry
 from caper_jax.articulation.conversions import ArtImageConversion, CaptraConversion, Front
 from caper_jax.articulation.mesh_object import MeshObject
-from caper_jax.articulation.urdf_rule import (
-    CanonicalAxes,
-    UrdfRule,
-    X,
-    level,
-    opening_sign,
-    opens_along,
-    snap_state,
-)
 from caper_jax.categories.forms import TURN_X, TURN_Y, UPSIDE_DOWN, about
 from caper_jax.geometry.solids import Solid, box, cylinder, frustum
 
@@ -157,19 +149,20 @@ def shape(rng: np.random.Generator) -> ObjectModel:
 
 def _perpendicular(ref: MeshObject) -> np.ndarray:
     """The lid's plate at 90 deg to the base's, on the side to which it opens."""
-    opening = ref.turn(0, level(ref.direction(0, 0)), ref.direction(1, 0))
+    opening = ref.turn(0, urdf.level(ref.direction(0, 0)), ref.direction(1, 0))
     if np.radians(10) < abs(opening) < np.radians(170):
         sense = np.sign(opening)
     elif abs(opening) <= np.radians(10):
-        sense = opening_sign(ref, 0)
+        sense = urdf.opening_sign(ref, 0)
     else:  # modeled flat open: most of the range closes it
-        sense = -opening_sign(ref, 0)
+        sense = -urdf.opening_sign(ref, 0)
         opening = sense * abs(opening)
-    return np.array([snap_state(sense * np.pi / 2 - opening, ref.limits[0], 6.0, quarter=True)])
+    state = sense * np.pi / 2 - opening
+    return np.array([urdf.snap_state(state, ref.limits[0], 6.0, quarter=True)])
 
 
 def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
-    return CanonicalAxes(ref.direction(1, 0), level(ref.direction(0, 0)))
+    return urdf.CanonicalAxes(ref.direction(1, 0), urdf.level(ref.direction(0, 0)))
 
 
 # In the files the lid stands at the back of the base.
@@ -191,10 +184,10 @@ LAPTOP = Category(
             reason="without a visible keyboard, base and lid are two like plates",
         ),
     ),
-    urdf_rule=UrdfRule(
+    urdf_rule=urdf.UrdfRule(
         rest=_perpendicular,
         axes=_urdf_axes,
-        opening=opens_along(-X),
+        opening=urdf.opens_along(-urdf.X),
         child_words=("screen", "lid", "display", "monitor"),
         partnet_classes=("Laptop",),
     ),

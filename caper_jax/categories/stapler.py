@@ -12,13 +12,7 @@ import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
 from caper_jax.articulation.conversions import ReArtConversion, StoredObject
-from caper_jax.articulation.urdf_rule import (
-    UrdfRule,
-    X,
-    closed_states,
-    hinged_axes,
-    opens_along,
-)
+from caper_jax.articulation.urdf_rule import UrdfRule, X, closed_states, hinged_axes, opens_along
 from caper_jax.categories.forms import TURN_X, TURN_Y, UP, about, beam, rotated
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid
 

@@ -10,18 +10,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from caper_jax.articulation import urdf_rule as urdf
 from caper_jax.articulation.category import Category, Joint, ObjectModel
 from caper_jax.articulation.conversions import ArtImageConversion, Front
 from caper_jax.articulation.mesh_object import MeshObject
-from caper_jax.articulation.urdf_rule import (
-    UrdfRule,
-    X,
-    closed_states,
-    hinged_axes,
-    opening_sign,
-    opens_along,
-    snap_state,
-)
 from caper_jax.categories.dishwasher.body import TYPES, Plan, body, controls, draw_plan, inside
 from caper_jax.categories.forms import TURN_X, TURN_Y, Handle, HandleStyle, about, rotated
 from caper_jax.geometry.solids import Solid, box, cylinder, frustum
@@ -157,9 +149,9 @@ def shape(rng: np.random.Generator) -> ObjectModel:
 
 def _quarter_open(ref: MeshObject) -> np.ndarray:
     """90 deg from closed."""
-    closed = float(closed_states(ref)[0])
-    sense = opening_sign(ref.at(np.array([closed])), 0)
-    return np.array([snap_state(closed + sense * np.pi / 2, ref.limits[0], 6.0)])
+    closed = float(urdf.closed_states(ref)[0])
+    sense = urdf.opening_sign(ref.at(np.array([closed])), 0)
+    return np.array([urdf.snap_state(closed + sense * np.pi / 2, ref.limits[0], 6.0)])
 
 
 DISHWASHER = Category(
@@ -172,10 +164,10 @@ DISHWASHER = Category(
     mean_size=((0.543, 0.776, 0.58), (0.532, 0.072, 0.633)),
     mean_center=((0.0, 0.0, -0.302), (0.0, -0.291, 0.276)),
     shape=shape,
-    urdf_rule=UrdfRule(
+    urdf_rule=urdf.UrdfRule(
         rest=_quarter_open,
-        axes=hinged_axes,
-        opening=opens_along(X),
+        axes=urdf.hinged_axes,
+        opening=urdf.opens_along(urdf.X),
         child_words=("door",),
         partnet_classes=("Dishwasher",),
     ),

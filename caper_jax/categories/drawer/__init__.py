@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from caper_jax.articulation import urdf_rule as urdf
 from caper_jax.articulation.category import Category, Joint, ObjectModel
 from caper_jax.articulation.conversions import (
     ArtImageConversion,
@@ -15,17 +16,6 @@ from caper_jax.articulation.conversions import (
     NotConvertible,
 )
 from caper_jax.articulation.mesh_object import MeshObject
-from caper_jax.articulation.urdf_rule import (
-    CanonicalAxes,
-    UrdfRule,
-    Y,
-    Z,
-    along_positive,
-    closed_states,
-    level,
-    opening_sign,
-    opens_along,
-)
 from caper_jax.categories.drawer import cabinet
 from caper_jax.categories.drawer.cabinet import Plan
 from caper_jax.categories.forms import TURN_Y, Handle, HandleStyle, StandStyle, open_box, stand
@@ -189,12 +179,12 @@ def shape(rng: np.random.Generator) -> ObjectModel:
 
 def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
     """Front where the drawers go, up along their stack."""
-    front = ref.axis[0] * opening_sign(ref, 0)
+    front = ref.axis[0] * urdf.opening_sign(ref, 0)
     up = _stack(ref, front)
     if up is None:
         # z, as in robotics, or y, as in graphics, where z lies along the front.
-        return CanonicalAxes(Z if abs(front[2]) < 0.7 else Y, front, ("up",))
-    return CanonicalAxes(up, front)
+        return urdf.CanonicalAxes(urdf.Z if abs(front[2]) < 0.7 else urdf.Y, front, ("up",))
+    return urdf.CanonicalAxes(up, front)
 
 
 def _stack(ref: MeshObject, front: np.ndarray) -> np.ndarray | None:
@@ -206,7 +196,7 @@ def _stack(ref: MeshObject, front: np.ndarray) -> np.ndarray | None:
     across = np.eye(3) - np.outer(front, front)
     centers = np.array([mesh.bounds().mean(0) for mesh in ref.parts[1:]]) @ across
     variance, directions = np.linalg.eigh(np.cov(centers.T))
-    up = along_positive(level(directions[:, -1]))
+    up = urdf.along_positive(urdf.level(directions[:, -1]))
     height, width = (
         np.mean([np.ptp(mesh.vertices @ direction) for mesh in ref.parts[1:]])
         for direction in (up, np.cross(up, front))
@@ -235,10 +225,10 @@ DRAWER = Category(
         (-0.002, 0.257, 0.031),
     ),
     shape=shape,
-    urdf_rule=UrdfRule(
-        rest=closed_states,
+    urdf_rule=urdf.UrdfRule(
+        rest=urdf.closed_states,
         axes=_urdf_axes,
-        opening=opens_along(Z),
+        opening=urdf.opens_along(urdf.Z),
         order=1,
         partnet_classes=("StorageFurniture", "Table"),
     ),

@@ -13,12 +13,7 @@ import numpy as np
 from caper_jax.articulation.category import Category, Joint, ObjectModel
 from caper_jax.articulation.conversions import ArtImageConversion, CaptraConversion, Front
 from caper_jax.articulation.mesh_object import MeshObject
-from caper_jax.articulation.urdf_rule import (
-    CanonicalAxes,
-    UrdfRule,
-    along_positive,
-    snap_state,
-)
+from caper_jax.articulation.urdf_rule import CanonicalAxes, UrdfRule, along_positive, snap_state
 from caper_jax.categories.eyeglasses import front as fronts
 from caper_jax.categories.forms import UP, about, beam, mirrored
 from caper_jax.geometry.solids import Solid, ellipsoid
