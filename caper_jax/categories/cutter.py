@@ -289,7 +289,7 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     return ObjectModel([handle, blade], _TRAVEL, mouth, limits)
 
 
-def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
+def _urdf_axes(ref: MeshObject) -> urdf.CanonicalAxes:
     """X where the blade goes, y out of the flat face, on the side of the slider.
 
     The face is where the blade, with its slider, clearly stands out of the handle; of a cutter

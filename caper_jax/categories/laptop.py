@@ -161,7 +161,7 @@ def _perpendicular(ref: MeshObject) -> np.ndarray:
     return np.array([urdf.snap_state(state, ref.limits[0], 6.0, quarter=True)])
 
 
-def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
+def _urdf_axes(ref: MeshObject) -> urdf.CanonicalAxes:
     return urdf.CanonicalAxes(ref.direction(1, 0), urdf.level(ref.direction(0, 0)))
 
 

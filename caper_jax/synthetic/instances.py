@@ -151,7 +151,7 @@ def _group(models: list[list[list[Solid]]]) -> SolidGroup:
     like = next(solid for row in rows for solid in row if solid is not None)
     hole = None if like.hole is None else like.hole.kind
 
-    def pack(value: Callable[[Solid], Any], free: np.ndarray) -> np.ndarray:
+    def pack(value: Callable[[Any], Any], free: np.ndarray) -> np.ndarray:
         """A value of every solid, ``free`` in free slots."""
         values = [[free if solid is None else value(solid) for solid in row] for row in rows]
         return np.array(values, np.float32)

@@ -177,7 +177,7 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     return ObjectModel([body, *drawers], np.tile([0.0, 0.0, 1.0], (3, 1)), np.array(pivots), limits)
 
 
-def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
+def _urdf_axes(ref: MeshObject) -> urdf.CanonicalAxes:
     """Front where the drawers go, up along their stack."""
     front = ref.axis[0] * urdf.opening_sign(ref, 0)
     up = _stack(ref, front)
