@@ -25,8 +25,8 @@ def stop(*arguments, **_):
 @pytest.mark.parametrize(
     ("options", "owner", "name"),
     [
-        ((), frames.Generator, "batch"),
-        (VIDEOS, videos.VideoGenerator, "batch"),
+        (("--instances", "4"), frames.Generator, "batch"),
+        ((*VIDEOS, "--instances", "4"), videos.VideoGenerator, "batch"),
         (("--images",), images, "render_image"),
         (("--layout", "artimage"), images, "render_still"),
         (("--layout", "pm-videos", *VIDEOS), images, "render_clip"),
