@@ -225,7 +225,8 @@ def test_everything_at_once_keeps_poses_and_labels_true(plain):
         holes=0.5,
     )
     batch = draw(config)
-    jax.tree.map(np.testing.assert_array_equal, batch.pose, plain.pose)
+    # Compiled apart, the two programs round differently.
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=0, atol=1e-5), batch.pose, plain.pose)
     np.testing.assert_array_equal(batch.instance, plain.instance)
     own = batch.labels >= 0
     outside = outside_part(batch.pose, batch.points, np.maximum(batch.labels, 0))
