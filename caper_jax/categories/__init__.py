@@ -120,20 +120,28 @@ def get(name: str | Category) -> Category:
 
 
 def _load(name: str) -> Category:
-    """Imports a user's module, once per process, and takes a category from it.
-
-    Args:
-      name: ``FILE.py:NAME``, or ``package.module:NAME`` of a module that Python finds (installed,
-        or on PYTHONPATH).
-
-    Raises:
-      CaperError: no such file, module or attribute; an attribute that is no Category; an exception
-        while importing.
-    """
+    """Imports a user's module, once per process, and takes a category from it; see ``get``."""
     source, _, attribute = name.rpartition(":")
     if not source or not attribute:
         raise CaperError(f"category {name!r}: give FILE.py:NAME or package.module:NAME")
-    module = _from_file(Path(source)) if source.endswith(".py") else _from_name(source)
+    is_file = source.endswith(".py")
+    if is_file and not Path(source).is_file():
+        raise CaperError(f"no file {source} to take a category from")
+    try:
+        module = _from_file(Path(source)) if is_file else importlib.import_module(source)
+    except (Exception, SystemExit) as error:
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if not is_file and missing and f"{source}.".startswith(f"{missing}."):
+            raise CaperError(
+                f"no module {missing!r} to take a category from; install it, set PYTHONPATH, "
+                "or give the path of a file that ends in .py"
+            ) from error
+        trace = traceback.extract_tb(error.__traceback__)
+        *_, last = (frame for frame in trace if not frame.filename.startswith("<frozen"))
+        # The message of a SyntaxError says the line itself; then the last frame is this one.
+        where = f" ({last.filename}, line {last.lineno})" if last.filename != __file__ else ""
+        raised = f"importing it raised {type(error).__name__}: {error}{where}"
+        raise CaperError(f"{source}: {raised}") from error
     found = getattr(module, attribute, None)
     if isinstance(found, Category):
         return found
@@ -145,8 +153,6 @@ def _load(name: str) -> Category:
 
 
 def _from_file(path: Path) -> ModuleType:
-    if not path.is_file():
-        raise CaperError(f"no file {path} to take a category from")
     path = path.resolve()
     # Not the file's own name, which might hide an installed module.
     name = f"caper_jax_user_module_{zlib.crc32(str(path).encode()):08x}"
@@ -158,35 +164,10 @@ def _from_file(path: Path) -> ModuleType:
     sys.modules[name] = module
     try:
         specification.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
+    except BaseException:
         del sys.modules[name]
-        raise _import_error(str(path), error) from error
+        raise
     return module
-
-
-def _from_name(name: str) -> ModuleType:
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name is not None and f"{name}.".startswith(f"{error.name}."):
-            raise CaperError(
-                f"no module {error.name!r} to take a category from; install it, set PYTHONPATH, "
-                "or give the path of a file that ends in .py"
-            ) from error
-        raise _import_error(name, error) from error
-    except (Exception, SystemExit) as error:
-        raise _import_error(name, error) from error
-
-
-def _import_error(source: str, error: BaseException) -> CaperError:
-    """What a user's module raised, and where."""
-    trace = traceback.extract_tb(error.__traceback__)
-    frames = [frame for frame in trace if not frame.filename.startswith("<frozen")]
-    where = ""
-    # The message of a SyntaxError says the line itself; a file read by us comes after this one.
-    if frames[-1].filename != __file__:
-        where = f" ({frames[-1].filename}, line {frames[-1].lineno})"
-    return CaperError(f"{source}: importing it raised {type(error).__name__}: {error}{where}")
 
 
 for _category in (BOX, CUTTER, DISHWASHER, DRAWER, EYEGLASSES, LAPTOP, ROBOTARM, SCISSORS, STAPLER):

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel, Symmetry
 from caper_jax.articulation.conversions import ReArtConversion
-from caper_jax.articulation.urdf_rule import (
-    UrdfRule,
-    X,
-    closed_states,
-    hinged_axes,
-    opens_along,
-)
-from caper_jax.categories.forms import about
+from caper_jax.articulation.urdf_rule import UrdfRule, X, closed_states, hinged_axes, opens_along
+from caper_jax.categories.forms import TURN_X, TURN_Y, UPSIDE_DOWN, open_box
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid, frustum
 
 # Positive opens: the lid, in front of the hinge (+z), swings up (+y), which is about -x.
 _HINGE = np.array([[-1.0, 0.0, 0.0]])
-_TURN_X = about("y", np.pi / 2)  # z -> x
-_UP, _DOWN = about("x", -np.pi / 2), about("x", np.pi / 2)  # z -> y and z -> -y
 
 
 def _pencil_case(rng: np.random.Generator) -> ObjectModel:
@@ -58,49 +52,40 @@ def _pencil_case(rng: np.random.Generator) -> ObjectModel:
     size = (length, height, depth)
     inset = wall + edge
     if edge:
-        base = _soft_tray((0.0, 0.0, 0.0), size, edge, wall, floor, upside_down=False)
+        base = list(_soft_tray((0.0, 0.0, 0.0), size, edge, wall, floor))
     elif rng.random() < 0.2:
         inset += _slope(rng, size)
         base = [_tapered_tray(size, inset - wall, wall, floor)]
     else:
-        base = [_tray(size, wall, floor, upside_down=False)]
+        base = [open_box((0, 0, 0), np.array(size) / 2, wall, floor)]
     base += _contents(rng, size, inset, floor, lid_bottom)
     if not on_top and rng.random() < 0.5:
         # The back wall with the hinge stays as high as the rim.
-        base.append(
-            box(
-                (0, height / 2 - lid_thickness / 2, hinge_z - wall / 2),
-                (length * rng.uniform(0.2, 0.48), lid_thickness / 2, wall / 2),
-            )
-        )
+        half = (length * rng.uniform(0.2, 0.48), lid_thickness / 2, wall / 2)
+        base.append(box((0, height / 2 - lid_thickness / 2, hinge_z - wall / 2), half))
     lid_front = hinge_z + lid_depth
     lid_center = (0.0, lid_bottom + lid_thickness / 2, (hinge_z + lid_front) / 2)
+    lid_size = (lid_length, lid_thickness, lid_depth)
     if rng.random() < 0.4:
         # A thin plate; a lip around it makes the lid's box as thick as measured.
         plate = min(scale * rng.uniform(0.002, 0.005), lid_thickness)
-        top = lid_bottom + lid_thickness
+        above = (0, lid_bottom + lid_thickness - plate / 2, lid_center[2])
+        ahead = (0, lid_center[1], lid_front - plate / 2)
         lid = [
-            box(
-                (0, top - plate / 2, lid_center[2]),
-                (lid_length / 2, plate / 2, lid_depth / 2),
-            ),
-            box(
-                (0, lid_center[1], lid_front - plate / 2),
-                (lid_length / 2, lid_thickness / 2, plate / 2),
-            ),
+            box(above, (lid_length / 2, plate / 2, lid_depth / 2)),
+            box(ahead, (lid_length / 2, lid_thickness / 2, plate / 2)),
         ]
     elif edge and on_top:
         lid_floor = max(0.25 * lid_thickness, 0.002)
-        lid_size = (lid_length, lid_thickness, lid_depth)
-        lid = _soft_tray(lid_center, lid_size, edge, wall, lid_floor, upside_down=True)
+        lid = list(_soft_tray(lid_center, lid_size, edge, wall, -lid_floor))
     else:
-        lid = [_lid_shell(rng, lid_center, (lid_length, lid_thickness, lid_depth), wall)]
+        lid = [_lid_shell(rng, lid_center, lid_size, wall)]
     if rng.random() < 0.5:
-        lid.append(_clasp(rng, lid_center, (lid_length, lid_thickness, lid_depth), height))
+        lid.append(_clasp(rng, lid_center, lid_size, height))
     if not edge and rng.random() < 0.4:
         radius = min(0.5 * lid_thickness, scale * 0.006)
         half_length = length * rng.uniform(0.1, 0.45)
-        base.append(cylinder((0, hinge_y, hinge_z), (radius, radius, half_length), _TURN_X))
+        base.append(cylinder((0, hinge_y, hinge_z), (radius, radius, half_length), TURN_X))
     high = np.radians(rng.uniform(170, 200))
     return _model(base, lid, (0.0, hinge_y, hinge_z), (np.radians(-3), high))
 
@@ -116,7 +101,7 @@ def _chest(rng: np.random.Generator) -> ObjectModel:
     if slope:
         base = [_tapered_tray(size, slope, wall, floor)]
     else:
-        base = [_tray(size, wall, floor, upside_down=False)]
+        base = [open_box((0, 0, 0), np.array(size) / 2, wall, floor)]
     base += _contents(rng, size, wall + slope, floor, height / 2)
     thickness = rng.uniform(0.003, 0.012)
     hinge = (0.0, height / 2, -depth / 2)
@@ -134,7 +119,7 @@ def _chest(rng: np.random.Generator) -> ObjectModel:
         half = (length / 2, depth / 2, rise / 2)
         hole = box((0, height / 2, 0), (0.6 * half[0], rise * rng.uniform(0.3, 0.7), 0.6 * half[1]))
         taper = rng.uniform(0.62, 0.95, 2)
-        lid = [frustum((0, height / 2 + rise / 2, 0), half, taper, _UP, hole=hole)]
+        lid = [frustum((0, height / 2 + rise / 2, 0), half, taper, TURN_Y, hole=hole)]
     elif style < 0.75:  # a lid with a rim around the base
         rim = height * rng.uniform(0.1, 0.4)
         size = (length + 2 * wall + 0.002, rim + thickness, depth + wall + 0.001)
@@ -144,14 +129,8 @@ def _chest(rng: np.random.Generator) -> ObjectModel:
         lid = [box(center, np.array(size) / 2, hole=hole)]
     else:  # a dome: half of an elliptic cylinder along x, hollow
         rise = depth * rng.uniform(0.15, 0.5)
-        lid = [
-            cylinder(
-                (0, height / 2, 0),
-                (depth / 2, rise, length / 2),
-                _TURN_X,
-                hole=box((0, height / 2 - rise, 0), (length, rise, depth)),
-            )
-        ]
+        below = box((0, height / 2 - rise, 0), (length, rise, depth))
+        lid = [cylinder((0, height / 2, 0), (depth / 2, rise, length / 2), TURN_X, hole=below)]
     if rng.random() < 0.4:
         lid.append(_clasp(rng, (0, height / 2, 0), (length, 2 * thickness, depth), height))
     elif rng.random() < 0.3:  # a knob to lift it by
@@ -159,48 +138,30 @@ def _chest(rng: np.random.Generator) -> ObjectModel:
         lid.append(ellipsoid((0, height / 2 + knob, depth / 2 + 0.6 * knob), (knob, knob, knob)))
     style = rng.random()
     foot = rng.uniform(0.004, 0.015)
+    x, y, z = 0.45 * length - foot - slope, -height / 2 - foot / 2, 0.45 * depth - foot - slope
     if style < 0.15:
-        for side_x in (-1, 1):
-            for side_z in (-1, 1):
-                x, z = (
-                    side_x * (0.45 * length - foot - slope),
-                    side_z * (0.45 * depth - foot - slope),
-                )
-                place = (x, -height / 2 - foot / 2, z)
-                base.append(cylinder(place, (foot, foot, foot / 2), _UP))
+        for place in ((-x, y, -z), (-x, y, z), (x, y, -z), (x, y, z)):
+            base.append(cylinder(place, (foot, foot, foot / 2), TURN_Y))
     elif style < 0.3:  # runners
-        for side_x in (-1, 1):
-            place = (side_x * (0.45 * length - foot - slope), -height / 2 - foot / 2, 0)
-            base.append(box(place, (foot, foot / 2, 0.45 * depth - slope)))
+        for side in (-x, x):
+            base.append(box((side, y, 0), (foot, foot / 2, 0.45 * depth - slope)))
     high = np.radians(rng.uniform(95, 185))
     return _model(base, lid, hinge, (0.0, high))
 
 
-def _tray(size, wall: float, floor: float, upside_down: bool, center=(0.0, 0.0, 0.0)) -> Solid:
-    """An open box: full extents ``size``, walls and floor in meters."""
-    length, height, depth = size
-    sign = -1.0 if upside_down else 1.0
-    cavity = np.asarray(center, float) + (0, sign * floor, 0)
-    half = (length / 2 - wall, height / 2, depth / 2 - wall)
-    return box(center, np.array(size) / 2, hole=box(cavity, half))
-
-
-def _soft_tray(
-    center, size, edge: float, wall: float, floor: float, upside_down: bool
-) -> list[Solid]:
+def _soft_tray(center, size, edge: float, wall: float, floor: float) -> Iterator[Solid]:
     """A tray whose front and sides bulge by ``edge`` meters, flat at the back."""
     length, height, depth = size
     middle = np.asarray(center, float)
-    inner = (length - 2 * edge, height, depth - edge)
-    solids = [_tray(inner, wall, floor, upside_down, middle - (0, 0, edge / 2))]
+    inner = np.array([length - 2 * edge, height, depth - edge])
+    yield open_box(middle - (0, 0, edge / 2), inner / 2, wall, floor)
     front = middle + (0, 0, depth / 2 - edge)
-    solids.append(cylinder(front, (edge, height / 2, length / 2 - edge), _TURN_X))
+    yield cylinder(front, (edge, height / 2, length / 2 - edge), TURN_X)
     for side in (-1, 1):
         end = (side * (length / 2 - edge), 0, 0)
         flank = middle - (0, 0, edge / 2) + end
-        solids.append(cylinder(flank, (edge, height / 2, depth / 2 - edge / 2)))
-        solids.append(ellipsoid(front + end, (edge, height / 2, edge)))
-    return solids
+        yield cylinder(flank, (edge, height / 2, depth / 2 - edge / 2))
+        yield ellipsoid(front + end, (edge, height / 2, edge))
 
 
 def _slope(rng: np.random.Generator, size) -> float:
@@ -214,35 +175,37 @@ def _tapered_tray(size, slope: float, wall: float, floor: float) -> Solid:
     half = np.array([size[0], size[2], size[1]]) / 2
     inner = half[:2] - slope - wall
     hole = box((0, floor, 0), (inner[0], half[2], inner[1]))
-    return frustum((0, 0, 0), half, 1 - slope / half[:2], _DOWN, hole=hole)
+    return frustum((0, 0, 0), half, 1 - slope / half[:2], UPSIDE_DOWN, hole=hole)
 
 
 def _lid_shell(rng: np.random.Generator, center, size, wall: float) -> Solid:
     """A plate, or a hollow shell when thick enough."""
     if size[1] > 0.009 and rng.random() < 0.75:
         floor = max(0.25 * size[1], 0.002)
-        return _tray(size, min(wall, 0.2 * size[1]) + 0.001, floor, True, center)
+        return open_box(center, np.array(size) / 2, min(wall, 0.2 * size[1]) + 0.001, -floor)
     return box(center, np.array(size) / 2)
 
 
-def _contents(rng: np.random.Generator, size, wall: float, floor: float, top: float) -> list[Solid]:
+def _contents(
+    rng: np.random.Generator, size, wall: float, floor: float, top: float
+) -> Iterator[Solid]:
     """Dividers, pens and blocks in the tray, below ``top`` (y, meters)."""
     length, height, depth = size
     bottom = -height / 2 + floor
     room = min(top, height / 2) - bottom
-    things: list[Solid] = []
     if room < 0.006:
-        return things
-    for _ in range(rng.integers(0, 3)):
+        return
+    dividers = rng.integers(0, 3)
+    for _ in range(dividers):
         reach = 0.5 * room * rng.uniform(0.4, 0.95)
         if rng.random() < 0.5:
             place = (rng.uniform(-0.35, 0.35) * length, bottom + reach, 0)
-            things.append(box(place, (0.0012, reach, depth / 2 - wall)))
+            yield box(place, (0.0012, reach, depth / 2 - wall))
         else:
             place = (0, bottom + reach, rng.uniform(-0.3, 0.3) * depth)
-            things.append(box(place, (length / 2 - wall, reach, 0.0012)))
+            yield box(place, (length / 2 - wall, reach, 0.0012))
     inner = np.array([length, depth]) / 2 - wall
-    for _ in range(rng.integers(0, 3 if len(things) < 2 else 2)):
+    for _ in range(rng.integers(0, 3 if dividers < 2 else 2)):
         rise = 0.5 * room * rng.uniform(0.2, 0.9)
         spot = rng.uniform(-0.25, 0.25, 2) * (length, depth)
         lying = rng.random() < 0.5  # a pen or a tube
@@ -254,10 +217,9 @@ def _contents(rng: np.random.Generator, size, wall: float, floor: float, top: fl
         half = np.minimum(half, 0.9 * inner)
         x, z = np.clip(spot, half - inner, inner - half)
         if lying:
-            things.append(cylinder((x, bottom + rise, z), (rise, rise, half[0]), _TURN_X))
+            yield cylinder((x, bottom + rise, z), (rise, rise, half[0]), TURN_X)
         else:
-            things.append(box((x, bottom + rise, z), (half[0], rise, half[1])))
-    return things
+            yield box((x, bottom + rise, z), (half[0], rise, half[1]))
 
 
 def _clasp(rng: np.random.Generator, center, size, height: float) -> Solid:

@@ -6,29 +6,19 @@ thumb moves with the blade and belongs to it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from caper_jax.articulation import urdf_rule as urdf
 from caper_jax.articulation.category import Category, Joint, ObjectModel
 from caper_jax.articulation.conversions import ReArtConversion, StoredObject
 from caper_jax.articulation.mesh_object import MeshObject
-from caper_jax.articulation.urdf_rule import (
-    CanonicalAxes,
-    UrdfRule,
-    X,
-    along_positive,
-    closed_states,
-    opening_sign,
-    opens_along,
-)
-from caper_jax.categories.forms import about, along, beam
+from caper_jax.categories.forms import TURN_X, TURN_Y, UP, along, beam
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid
 
 _TRAVEL = np.array([[1.0, 0.0, 0.0]])
-_TURN_X = about("y", np.pi / 2)  # cylinder z -> x
-_TURN_Y = about("x", -np.pi / 2)  # cylinder z -> y
-_UP = (0.0, 1.0, 0.0)
 
 _LONGEST = 0.115  # meters of extension that any instance allows
 _SHARE = 0.9  # of the slider's way that is used
@@ -47,34 +37,21 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class _Plan:
-    """Measures in meters; the handle spans x in [0, length] and y in [-height / 2, height / 2].
+    """Measures in meters; the handle spans x in [0, length] and y in [-height / 2, height / 2]."""
 
-    Attributes:
-      length, width, height: of the handle.
-      back, front: x of the ends of its body; before and behind come its round end and its nose.
-      floor: y of the underside of the blade's channel.
-      gap: height of the channel.
-      blade: width of the blade.
-      aside: z of the middle of blade and slot.
-      slot: x of the slot's ends.
-      slot_width: its width.
-      slider: length of the slider.
-      edge: the slider runs on the narrow side (-z) instead of the flat face.
-    """
-
-    length: float
+    length: float  # of the handle
     width: float
     height: float
-    back: float
+    back: float  # x of the ends of its body, between its round end and its nose
     front: float
-    floor: float
-    gap: float
-    blade: float
-    aside: float
-    slot: tuple[float, float]
-    slot_width: float
-    slider: float
-    edge: bool
+    floor: float  # y of the underside of the blade's channel
+    gap: float  # height of the channel
+    blade: float  # width of the blade
+    aside: float  # z of the middle of blade and slot
+    slot: tuple[float, float]  # x of the slot's ends
+    slot_width: float  # its width
+    slider: float  # length of the slider
+    edge: bool  # the slider runs on the narrow side (-z) instead of the flat face
 
 
 def _draw_plan(rng: np.random.Generator, name: str) -> _Plan:
@@ -114,7 +91,7 @@ def _draw_plan(rng: np.random.Generator, name: str) -> _Plan:
     )
 
 
-def _handle(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
+def _handle(rng: np.random.Generator, plan: _Plan, name: str) -> Iterator[Solid]:
     """Two shells with the channel of the blade between them, or one round body; and trimmings."""
     back, front = plan.back, plan.front
     middle, reach = (back + front) / 2, (front - back) / 2
@@ -122,10 +99,9 @@ def _handle(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
     half = plan.width / 2
     slot = _slot(plan, (plan.slot[0] + plan.slot[1]) / 2, (plan.slot[1] - plan.slot[0]) / 2)
     style = rng.random()
-    solids = []
     if name == "pen" or (style < 0.15 and not plan.edge):
         radii = (half, plan.height / 2, reach)
-        solids = [cylinder((middle, 0, 0), radii, _TURN_X, hole=slot)]
+        yield cylinder((middle, 0, 0), radii, TURN_X, hole=slot)
     else:
         # Rounded or tapered, but never so that the sides come into the channel.
         rim = (half - plan.blade / 2 - abs(plan.aside) - 0.0005) / 2
@@ -133,9 +109,8 @@ def _handle(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
         round_ = round_ if style < 0.6 and not plan.edge else 0.0
         narrow, flat = 1.0, 1.0
         if style > 0.75:
-            narrow = max(
-                rng.uniform(0.5, 1.0), (plan.blade + 2 * abs(plan.aside) + 0.001) / half / 2
-            )
+            inner = plan.blade + 2 * abs(plan.aside) + 0.001
+            narrow = max(rng.uniform(0.5, 1.0), inner / half / 2)
             flat = rng.uniform(0.6, 1.0)
         channel = box((middle + 0.004, top, plan.aside), (reach, plan.gap, plan.blade / 2 + 0.0003))
         for bottom, height, hole, share in (
@@ -145,25 +120,22 @@ def _handle(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
             section = (half - round_, height / 2)
             y = bottom + height / 2
             end = y - (1 - share) * height / 2
-            shell = beam((back, y, 0), (front, end, 0), section, _UP, _taper(narrow, share))
-            solids.append(replace(shell, hole=hole))
+            shell = beam((back, y, 0), (front, end, 0), section, UP, _taper(narrow, share))
+            yield replace(shell, hole=hole)
         for side in (-1, 1) if round_ > 0.0008 else ():
             place = (middle, 0, side * (half - round_))
-            solids.append(cylinder(place, (round_, plan.height / 2, reach), _TURN_X))
+            yield cylinder(place, (round_, plan.height / 2, reach), TURN_X)
         if style > 0.9 and not plan.edge:  # a belly for the hand
-            radii = (
-                reach * rng.uniform(0.5, 0.85),
-                0.499 * plan.height,
-                half * rng.uniform(1.05, 1.35),
-            )
-            solids.append(ellipsoid((back + radii[0], 0, 0), radii, hole=slot))
-    solids += _front(rng, plan, name) + _back(rng, plan, name)
+            length, wide = reach * rng.uniform(0.5, 0.85), half * rng.uniform(1.05, 1.35)
+            radii = (length, 0.499 * plan.height, wide)
+            yield ellipsoid((back + radii[0], 0, 0), radii, hole=slot)
+    yield from _front(rng, plan, name)
+    yield from _back(rng, plan, name)
     if rng.random() < 0.35 and not plan.edge:  # pads for the fingers, on the long sides
         for side in (-1, 1):
             length = reach * rng.uniform(0.1, 0.5)
             place = (front - length - reach * rng.uniform(0.05, 0.3), 0, side * half)
-            solids.append(box(place, (length, plan.height * rng.uniform(0.15, 0.35), 0.001)))
-    return solids
+            yield box(place, (length, plan.height * rng.uniform(0.15, 0.35), 0.001))
 
 
 def _taper(narrow: float, flat: float) -> tuple[float, float] | None:
@@ -181,12 +153,12 @@ def _slot(plan: _Plan, middle: float, half: float) -> Solid:
     return box(center, (half, depth / 2, plan.slot_width / 2))
 
 
-def _front(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
+def _front(rng: np.random.Generator, plan: _Plan, name: str) -> Iterator[Solid]:
     """From the end of the body to the mouth: a nose, or a sheet metal sleeve open at the top."""
     start, end = plan.front, plan.length
     middle, reach = (start + end) / 2, (end - start) / 2
     if reach < 0.001:
-        return []
+        return
     if name in ("utility", "pen"):
         # Nose: narrower to the mouth, and on knives for packing leaning to the edge's side.
         half = plan.width / 2
@@ -194,63 +166,53 @@ def _front(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
         narrow = 0.6 if name == "pen" else rng.uniform(mouth, 1.0)
         lean = (1 - narrow) * half * rng.uniform(-0.7, 0.7) if name == "utility" else 0.0
         flat = narrow if name == "pen" else rng.uniform(0.5, 1.0)
-        section = (half, plan.height / 2)
-        nose = beam(
-            (start, 0, 0),
-            (end, 0, lean),
-            section,
-            _UP,
-            narrow if name == "pen" else (narrow, flat),
-            round_=name == "pen",
-        )
-        return [nose]
+        ends, taper = ((start, 0, 0), (end, 0, lean)), narrow if name == "pen" else (narrow, flat)
+        yield beam(*ends, (half, plan.height / 2), UP, taper, round_=name == "pen")
+        return
     wall = rng.uniform(0.0006, 0.0015)
     low = plan.floor - wall
     high = min(plan.floor + plan.gap + wall, plan.height / 2)
     half = plan.blade / 2 + wall
-    open_ = box(
-        (middle, high, plan.aside), (2 * reach, high - plan.floor, half * rng.uniform(0.4, 0.85))
-    )
+    open_half = (2 * reach, high - plan.floor, half * rng.uniform(0.4, 0.85))
+    open_ = box((middle, high, plan.aside), open_half)
     center = (middle - 0.002, (low + high) / 2, plan.aside)
-    return [box(center, (reach + 0.002, (high - low) / 2, half), hole=open_)]
+    yield box(center, (reach + 0.002, (high - low) / 2, half), hole=open_)
 
 
-def _back(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
+def _back(rng: np.random.Generator, plan: _Plan, name: str) -> Iterator[Solid]:
     """A round end, a cap, or a grip that bends away; perhaps a wheel, a lanyard hole, a clip."""
     half, thick = plan.width / 2, plan.height / 2
-    solids = []
     style = rng.random()
     if plan.back > 0 and name == "utility" and style < 0.6:
         lean = np.sin(np.radians(rng.uniform(-4, 14)))
         start = (plan.back + 0.004, 0, 0)
         end = (0, 0, lean * plan.back)
         taper = (rng.uniform(0.7, 1.0), rng.uniform(0.8, 1.0))
-        solids.append(beam(start, end, (half, 0.98 * thick), _UP, taper))
+        yield beam(start, end, (half, 0.98 * thick), UP, taper)
     elif plan.back > 0:
         # Its front half lies in the body, where it must leave slot and channel free.
         hole = box((2 * plan.back, 0, 0), (plan.back, plan.height, plan.width))
         if plan.slot[0] > 2 * plan.back and rng.random() < 0.5:  # for a lanyard
             radius = min(0.3 * half, 0.4 * plan.back)
-            hole = cylinder((0.55 * plan.back, 0, 0), (radius, radius, half), _TURN_Y)
+            hole = cylinder((0.55 * plan.back, 0, 0), (radius, radius, half), TURN_Y)
         radii = (plan.back, half, thick * rng.uniform(0.7, 0.99))
-        solids.append(cylinder((plan.back, 0, 0), radii, _TURN_Y, hole=hole))
+        yield cylinder((plan.back, 0, 0), radii, TURN_Y, hole=hole)
     if name == "pen" or rng.random() < 0.15:  # a cap
         reach = plan.length * rng.uniform(0.03, 0.07)
         radii = (0.8 * half, 0.9 * thick, reach)
-        solids.append(cylinder((plan.back - 0.3 * reach, 0, 0), radii, _TURN_X))
+        yield cylinder((plan.back - 0.3 * reach, 0, 0), radii, TURN_X)
     if name in ("wide", "slim") and rng.random() < 0.12 and plan.slot[0] - plan.back > 0.014:
         radius = min(0.4 * half, 0.007)
         place = ((plan.slot[0] + plan.back) / 2 - 0.002, thick + 0.001, 0)
-        solids.append(cylinder(place, (radius, radius, 0.0025), _TURN_Y))
+        yield cylinder(place, (radius, radius, 0.0025), TURN_Y)
     if (name == "pen" or (name == "slim" and rng.random() < 0.25)) and plan.back < 0.01:
         reach = plan.length * rng.uniform(0.12, 0.2)
         place = (plan.back + reach, -thick - 0.0015, 0)
-        solids.append(box(place, (reach, 0.0004, 0.0022)))
-        solids.append(box((plan.back + 0.0015, -thick - 0.0006, 0), (0.0015, 0.0013, 0.0022)))
-    return solids
+        yield box(place, (reach, 0.0004, 0.0022))
+        yield box((plan.back + 0.0015, -thick - 0.0006, 0), (0.0015, 0.0013, 0.0022))
 
 
-def _blade(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
+def _blade(rng: np.random.Generator, plan: _Plan, name: str) -> Iterator[Solid]:
     """The blade, its tip cut at an angle, and the carrier, neck and slider that move with it."""
     thick = min(rng.uniform(0.0004, 0.0009), 0.7 * plan.gap)
     level = plan.floor + plan.gap / 2
@@ -261,19 +223,19 @@ def _blade(rng: np.random.Generator, plan: _Plan, name: str) -> list[Solid]:
     angle = np.radians(rng.uniform(28, 50) if name == "pen" else rng.uniform(35, 68))
     point = np.array([tip, level, plan.aside + side * plan.blade / 2])
     normal = np.array([np.sin(angle), 0.0, -side * np.cos(angle)])
-    frame = along(normal, _UP)
+    frame = along(normal, UP)
     size = 2 * plan.blade / np.sin(angle)
     cut = box(point + size * normal, (size, size, size), frame)
     start = tail if name not in ("utility", "pen") else max(tail, tip - rng.uniform(0.045, 0.062))
     center, half = (start + tip) / 2, (tip - start) / 2
-    solids = [box((center, level, plan.aside), (half, thick / 2, plan.blade / 2), hole=cut)]
+    yield box((center, level, plan.aside), (half, thick / 2, plan.blade / 2), hole=cut)
     reach = (max(start, at + plan.slider / 2) + 0.003 - tail) / 2
     place = (tail + reach, level, plan.aside)
-    solids.append(box(place, (reach, 0.46 * plan.gap, 0.42 * plan.blade)))
-    return solids + _slider(rng, plan, at)
+    yield box(place, (reach, 0.46 * plan.gap, 0.42 * plan.blade))
+    yield from _slider(rng, plan, at)
 
 
-def _slider(rng: np.random.Generator, plan: _Plan, at: float) -> list[Solid]:
+def _slider(rng: np.random.Generator, plan: _Plan, at: float) -> Iterator[Solid]:
     """The neck through the slot and what the thumb pushes, around x = ``at``."""
     reach = plan.slider / 2
     rise = rng.uniform(0.0012, 0.0055)
@@ -283,59 +245,57 @@ def _slider(rng: np.random.Generator, plan: _Plan, at: float) -> list[Solid]:
         inner, outer = -plan.width * 0.22, -plan.width / 2 - rise
         neck_z = ((inner + outer) / 2, (inner - outer) / 2)
         drop = (middle - half_y + plan.floor) / 2, (middle + half_y - plan.floor) / 2
-        return [
-            box((at, drop[0], inner), (0.8 * reach, drop[1], 0.0015)),
-            box((at, middle, neck_z[0]), (0.8 * reach, half_y, neck_z[1])),
-            box((at, middle, outer + rise / 2), (reach, min(2 * half_y, 0.004), 0.8 * rise / 2)),
-        ]
+        yield box((at, drop[0], inner), (0.8 * reach, drop[1], 0.0015))
+        yield box((at, middle, neck_z[0]), (0.8 * reach, half_y, neck_z[1]))
+        yield box((at, middle, outer + rise / 2), (reach, min(2 * half_y, 0.004), 0.8 * rise / 2))
+        return
     face = plan.height / 2 + 0.0002
     half = min(rng.uniform(0.6, 1.6) * plan.slot_width, 0.45 * plan.width)
     neck = (face + 0.0005 - plan.floor - 0.2 * plan.gap) / 2
     place = (at, face + 0.0005 - neck, plan.aside)
-    solids = [box(place, (0.8 * reach, neck, 0.42 * plan.slot_width))]
+    yield box(place, (0.8 * reach, neck, 0.42 * plan.slot_width))
     style = rng.random()
     if style < 0.45:  # a plate with ribs
-        solids.append(box((at, face + rise / 2, plan.aside), (reach, rise / 2, half)))
+        yield box((at, face + rise / 2, plan.aside), (reach, rise / 2, half))
         count = int(rng.integers(0, 4))
         for rib in range(count):
             x = at + reach * (2 * (rib + 0.5) / count - 1)
-            solids.append(box((x, face + rise, plan.aside), (0.0008, 0.0007, 0.9 * half)))
+            yield box((x, face + rise, plan.aside), (0.0008, 0.0007, 0.9 * half))
     elif style < 0.65:  # a hump
         center = (at, face - 0.0001, plan.aside)
         below = box((at, face - rise, plan.aside), (2 * reach, rise, 2 * half))
-        solids.append(ellipsoid(center, (reach, 1.3 * rise, half), hole=below))
+        yield ellipsoid(center, (reach, 1.3 * rise, half), hole=below)
     elif style < 0.85:  # a ramp that the thumb leans against
         foot, head = (at - reach, face, plan.aside), (at + reach, face, plan.aside)
-        ramp = beam(head, foot, (half, 1.3 * rise), _UP, (1.0, rng.uniform(0.2, 0.7)))
+        ramp = beam(head, foot, (half, 1.3 * rise), UP, (1.0, rng.uniform(0.2, 0.7)))
         below = box((at, face - 2 * rise, plan.aside), (2 * reach, 2 * rise, 2 * half))
-        solids.append(replace(ramp, hole=below))
+        yield replace(ramp, hole=below)
     else:  # a plate with the wheel that locks it
-        solids.append(box((at, face + rise / 4, plan.aside), (reach, rise / 4, half)))
+        yield box((at, face + rise / 4, plan.aside), (reach, rise / 4, half))
         radius = min(rng.uniform(0.0035, 0.008), 0.45 * plan.width, reach)
         height = rng.uniform(0.001, 0.003)
         place = (at, face + rise / 2 + height - 0.0001, plan.aside)
-        solids.append(cylinder(place, (radius, radius, height), _TURN_Y))
-    return solids
+        yield cylinder(place, (radius, radius, height), TURN_Y)
 
 
 def shape(rng: np.random.Generator) -> ObjectModel:
     """Draws one cutter; two in three have the proportions of the ReArt-48 ones."""
     name = str(rng.choice(list(_TYPES), p=[row[0] for row in _TYPES.values()]))
     plan = _draw_plan(rng, name)
-    handle, blade = _handle(rng, plan, name), _blade(rng, plan, name)
+    handle, blade = list(_handle(rng, plan, name)), list(_blade(rng, plan, name))
     way = plan.slot[1] - plan.slot[0] - plan.slider - 0.001
     limits = np.array([[0.0, min(_SHARE * way, _LONGEST)]])
     mouth = np.array([[plan.length, plan.floor + plan.gap / 2, plan.aside]])
     return ObjectModel([handle, blade], _TRAVEL, mouth, limits)
 
 
-def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
+def _urdf_axes(ref: MeshObject) -> urdf.CanonicalAxes:
     """X where the blade goes, y out of the flat face, on the side of the slider.
 
     The face is where the blade, with its slider, clearly stands out of the handle; of a cutter
     without such a slider, the face across the handle's thin direction.
     """
-    travel = ref.axis[0] * opening_sign(ref, 0)
+    travel = ref.axis[0] * urdf.opening_sign(ref, 0)
 
     def shift(direction: np.ndarray) -> float:
         """Of the blade's middle from the handle's, as a share of the handle."""
@@ -350,8 +310,8 @@ def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
         second = across @ ref.parts[0].moments()[2] @ across
         # The travel itself has the value 0; the thin direction comes next.
         up = np.linalg.eigh(second)[1][:, 1]
-    up = up * np.sign(shift(up)) if abs(shift(up)) > 0.05 else along_positive(up)
-    return CanonicalAxes(up, np.cross(travel, up))
+    up = up * np.sign(shift(up)) if abs(shift(up)) > 0.05 else urdf.along_positive(up)
+    return urdf.CanonicalAxes(up, np.cross(travel, up))
 
 
 def _stored_extension(stored: StoredObject) -> float:
@@ -373,10 +333,10 @@ CUTTER = Category(
     mean_size=((0.141, 0.015, 0.029), (0.114, 0.013, 0.017)),
     mean_center=((0.0, -0.002, 0.0), (0.012, 0.003, 0.0)),
     shape=shape,
-    urdf_rule=UrdfRule(
-        rest=closed_states,
+    urdf_rule=urdf.UrdfRule(
+        rest=urdf.closed_states,
         axes=_urdf_axes,
-        opening=opens_along(X),
+        opening=urdf.opens_along(urdf.X),
         partnet_classes=("Knife",),
     ),
     datasets={

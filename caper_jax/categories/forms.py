@@ -6,6 +6,7 @@ Meters, y up; handles sit on fronts that face +z.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -84,7 +85,13 @@ def beam(start, end, half, up, taper=None, round_: bool = False) -> Solid:
     return frustum(center, extents, np.broadcast_to(taper, (2,)), rotation)
 
 
-def chain(points, half, up, closed: bool = False, round_: bool = False) -> list[Solid]:
+def open_box(center, half, wall: float, floor: float) -> Solid:
+    """A box without a top, meters; one without a bottom where ``floor`` is negative."""
+    center, half = np.asarray(center, np.float64), np.asarray(half, np.float64)
+    return box(center, half, hole=box(center + (0, floor, 0), half - (wall, 0, wall)))
+
+
+def chain(points, half, up, closed: bool = False, round_: bool = False) -> Iterator[Solid]:
     """Beams that join ``points`` [n, 3] one after the other; ``closed`` joins the ends too.
 
     Each reaches a little beyond its corners, so that no gap shows on the outside of a bend.
@@ -94,14 +101,13 @@ def chain(points, half, up, closed: bool = False, round_: bool = False) -> list[
     """
     points = np.asarray(points, np.float64)
     ends = np.roll(points, -1, axis=0) if closed else points[1:]
-    solids = []
     for start, end in zip(points[: len(ends)], ends, strict=True):
         way = end - start
         reach = 0.35 * half[0] / math.sqrt(way @ way) * way
-        solids.append(beam(start - reach, end + reach, half, up, None, round_))
-    return solids
+        yield beam(start - reach, end + reach, half, up, None, round_)
 
 
+UP = (0.0, 1.0, 0.0)
 TURN_X = about("y", np.pi / 2)  # takes the axis of a cylinder from z to x
 TURN_Y = about("x", -np.pi / 2)  # and from z to y
 UPSIDE_DOWN = about("x", np.pi / 2)  # takes z to -y: tapers downwards
@@ -153,7 +159,7 @@ class Handle:
             inset=rng.uniform(0.02, 0.14),
         )
 
-    def on(self, center, width: float, height: float) -> list[Solid]:
+    def on(self, center, width: float, height: float) -> Iterator[Solid]:
         """The solids, at most four and mostly one or two, on a front [width, height].
 
         Args:
@@ -161,48 +167,47 @@ class Handle:
         """
         x, y, z = center
         half = min(self.half, 0.4 * height)
-        if self.style == "none":
-            return []
         if self.style == "lip":
             half = min(half, 0.1 * height)
-            return [box((x, y, z + 0.35 * self.reach), (0.499 * width, half, 0.4 * self.reach))]
-        if self.style in ("rod", "staple", "tag"):
-            return self._bar((x, y, z), 0.5 * self.share * width, half, height)
-        spread = 0.27 * width
-        places = (x - spread, x + spread) if self.pair else (x,)
-        return [solid for place in places for solid in self._knob((place, y, z), half)]
+            yield box((x, y, z + 0.35 * self.reach), (0.499 * width, half, 0.4 * self.reach))
+        elif self.style in ("rod", "staple", "tag"):
+            yield from self._bar((x, y, z), 0.5 * self.share * width, half, height)
+        elif self.style != "none":
+            spread = 0.27 * width
+            for place in (x - spread, x + spread) if self.pair else (x,):
+                yield from self._knob((place, y, z), half)
 
-    def _bar(self, center, reach_x: float, half: float, height: float) -> list[Solid]:
+    def _bar(self, center, reach_x: float, half: float, height: float) -> Iterator[Solid]:
         x, y, z = center
         out = self.reach
         if self.style == "staple":
             hole = box((x, y, z), (reach_x - 2 * half, 2 * half, out - 1.6 * half))
-            return [box((x, y, z + out / 2), (reach_x, half, out / 2), hole=hole)]
+            yield box((x, y, z + out / 2), (reach_x, half, out / 2), hole=hole)
+            return
         post = reach_x * (1 - 2 * self.inset) - half
-        solids = [cylinder((x, y, z + out - half), (half, half, reach_x), TURN_X)]
+        yield cylinder((x, y, z + out - half), (half, half, reach_x), TURN_X)
         for side in (-1, 1):
             place = (x + side * post, y, z + (out - half) / 2)
-            solids.append(box(place, (0.8 * half, 0.8 * half, (out - half) / 2)))
+            yield box(place, (0.8 * half, 0.8 * half, (out - half) / 2))
         if self.style == "tag":
             rise = min(0.028, 0.22 * height)
-            solids.append(box((x, y + 1.5 * rise, z), (0.6 * reach_x, 0.5 * rise, half / 2)))
-        return solids
+            yield box((x, y + 1.5 * rise, z), (0.6 * reach_x, 0.5 * rise, half / 2))
 
-    def _knob(self, center, half: float) -> list[Solid]:
+    def _knob(self, center, half: float) -> Iterator[Solid]:
         x, y, z = center
         out = self.reach
         if self.style == "cup":
-            wide = 2.6 * half
-            return [ellipsoid((x, y, z + 0.35 * out), (wide, half, 0.65 * out))]
+            yield ellipsoid((x, y, z + 0.35 * out), (2.6 * half, half, 0.65 * out))
+            return
+        make = cylinder if self.style == "knob" else ellipsoid
         if self.pair:  # of one piece each
-            extents = (half, half, out / 2)
-            return [
-                (cylinder if self.style == "knob" else ellipsoid)((x, y, z + 0.4 * out), extents)
-            ]
-        stem = cylinder((x, y, z + 0.4 * out), (0.45 * half, 0.45 * half, 0.4 * out))
+            yield make((x, y, z + 0.4 * out), (half, half, out / 2))
+            return
+        yield cylinder((x, y, z + 0.4 * out), (0.45 * half, 0.45 * half, 0.4 * out))
         if self.style == "knob":
-            return [stem, cylinder((x, y, z + 0.82 * out), (half, half, 0.18 * out))]
-        return [stem, ellipsoid((x, y, z + out - 0.75 * half), (half, half, 0.75 * half))]
+            yield cylinder((x, y, z + 0.82 * out), (half, half, 0.18 * out))
+        else:
+            yield ellipsoid((x, y, z + out - 0.75 * half), (half, half, 0.75 * half))
 
 
 StandStyle = Literal["floor", "plinth", "tapered", "square", "round", "castors", "runners", "sides"]
@@ -210,7 +215,7 @@ StandStyle = Literal["floor", "plinth", "tapered", "square", "round", "castors",
 
 def stand(
     rng: np.random.Generator, style: StandStyle, size: tuple[float, float, float]
-) -> list[Solid]:
+) -> Iterator[Solid]:
     """What carries a cabinet: at most four solids between y = 0 and y = height.
 
     Args:
@@ -219,35 +224,34 @@ def stand(
       size: (width, height, depth); x is centered, the front is at z = 0.
     """
     width, height, depth = size
-    if style == "floor":
-        return []
     half = np.array([width, height, depth]) / 2
+    if style == "floor":
+        return
     if style == "plinth":
         back = rng.uniform(0.0, 0.12) * depth
         aside = rng.uniform(0.0, 0.04) * width
         front = rng.uniform(0.005, 0.12) * depth
         z = (-front - (depth - back)) / 2
-        return [box((0, half[1], z), (half[0] - aside, half[1], (depth - front - back) / 2))]
+        yield box((0, half[1], z), (half[0] - aside, half[1], (depth - front - back) / 2))
+        return
     if style in ("runners", "sides"):
         thick = width * (rng.uniform(0.015, 0.035) if style == "sides" else 0.035)
         inset = 0.0 if style == "sides" else rng.uniform(0.0, 0.08) * width
-        return [
-            box((side * (half[0] - thick - inset), half[1], -half[2]), (thick, half[1], half[2]))
-            for side in (-1, 1)
-        ]
+        for side in (-1, 1):
+            place = (side * (half[0] - thick - inset), half[1], -half[2])
+            yield box(place, (thick, half[1], half[2]))
+        return
     thick = min(rng.uniform(0.018, 0.04) * np.sqrt(width * depth), 0.6 * height + 0.006)
     inset = thick + rng.uniform(0.0, 0.1) * min(width, depth)
     taper = rng.uniform(0.4, 0.8, size=2)
-    solids: list[Solid] = []
     for x in (-half[0] + inset, half[0] - inset):
         for z in (-inset, -depth + inset):
+            place = (x, half[1], z)
             if style == "tapered":
-                extents = (thick, thick, half[1])
-                solids.append(frustum((x, half[1], z), extents, taper, UPSIDE_DOWN))
+                yield frustum(place, (thick, thick, half[1]), taper, UPSIDE_DOWN)
             elif style == "square":
-                solids.append(box((x, half[1], z), (thick, half[1], thick)))
+                yield box(place, (thick, half[1], thick))
             elif style == "round":
-                solids.append(cylinder((x, half[1], z), (thick, thick, half[1]), TURN_Y))
+                yield cylinder(place, (thick, thick, half[1]), TURN_Y)
             else:  # castors: wheels as high as the gap that they fill
-                solids.append(cylinder((x, half[1], z), (half[1], half[1], 0.45 * thick), TURN_X))
-    return solids
+                yield cylinder(place, (half[1], half[1], 0.45 * thick), TURN_X)

@@ -13,6 +13,7 @@ The frame and the root follow from the object itself:
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,13 +26,11 @@ from caper_jax.articulation.conversions import (
     ReArtConversion,
     RestObject,
 )
-from caper_jax.categories.forms import about, beam, chain, mirrored, rotated
+from caper_jax.categories.forms import TURN_Y, UP, about, beam, chain, mirrored, rotated
 from caper_jax.categories.scissors_urdf import URDF_RULE
 from caper_jax.errors import CaperError
 from caper_jax.geometry.solids import Solid, box, cylinder
 
-_Y = np.array([0.0, 1.0, 0.0])
-_FLAT = about("x", -np.pi / 2)  # cylinder z -> y
 _HALF_TURN = np.diag([1.0, -1.0, -1.0])
 _REST = np.radians(20.0)
 _CLOSED, _WIDE = np.radians(3.0), np.radians(60.0)
@@ -39,52 +38,33 @@ _CLOSED, _WIDE = np.radians(3.0), np.radians(60.0)
 
 @dataclass(frozen=True)
 class _Half:
-    """One blade with its handle, closed: tip at +x, handle at -x and -z; lengths in meters.
+    """One blade with its handle, closed: tip at +x, handle at -x and -z; lengths in meters."""
 
-    Attributes:
-      blade: from the pivot to the tip.
-      width: of the blade at the pivot.
-      tip: width of the blade at its tip.
-      belly: where the blade starts to narrow, as a share of its length.
-      round_tip: a disc as wide as ``tip`` ends the blade.
-      metal: thickness of the blade.
-      shank: from the pivot to the handle's loop.
-      loop: (a, b) half extents of the opening for the fingers, along and across the handle.
-      flat: share of the opening's half width that its inner side is flattened to, 1 for an oval.
-      egg: how much wider the loop is towards its end than its middle.
-      tube: (half width, half thickness) of the loop's section.
-      ring: a ring with upright sides instead of a round tube.
-      splay: angle of the loop to the handle's line, radians.
-      gap: least distance of the handle from the middle when closed.
-      sheath: (half width, half thickness) of the plastic around the shank, or None.
-      screw: (radius, height) of the disc at the pivot.
-      teeth: number of bosses on the inner side of the shank.
-      rest: length of the finger rest behind the loop, or 0.
-      bend: angle of the handle to the blade, radians; positive turns it to +z.
-    """
-
-    blade: float
-    width: float
-    tip: float
-    belly: float
-    round_tip: bool
-    metal: float
-    shank: float
+    blade: float  # from the pivot to the tip
+    width: float  # of the blade at the pivot
+    tip: float  # width of the blade at its tip
+    belly: float  # where the blade starts to narrow, as a share of its length
+    round_tip: bool  # a disc as wide as ``tip`` ends the blade
+    metal: float  # thickness of the blade
+    shank: float  # from the pivot to the handle's loop
+    # (a, b) half extents of the opening for the fingers, along and across the handle.
     loop: tuple[float, float]
+    # Share of the opening's half width that its inner side is flattened to, 1 for an oval.
     flat: float
-    egg: float
-    tube: tuple[float, float]
-    ring: bool
-    splay: float
-    gap: float
+    egg: float  # how much wider the loop is towards its end than its middle
+    tube: tuple[float, float]  # (half width, half thickness) of the loop's section
+    ring: bool  # a ring with upright sides instead of a round tube
+    splay: float  # angle of the loop to the handle's line, radians
+    gap: float  # least distance of the handle from the middle when closed
+    # (half width, half thickness) of the plastic around the shank, or None.
     sheath: tuple[float, float] | None
-    screw: tuple[float, float]
-    teeth: int = 0
-    rest: float = 0.0
-    bend: float = 0.0
+    screw: tuple[float, float]  # (radius, height) of the disc at the pivot
+    teeth: int = 0  # number of bosses on the inner side of the shank
+    rest: float = 0.0  # length of the finger rest behind the loop, or 0
+    bend: float = 0.0  # angle of the handle to the blade, radians; positive turns it to +z
 
 
-def _blade(half: _Half) -> list[Solid]:
+def _blade(half: _Half) -> Iterator[Solid]:
     """Above the plane y = 0 in which the blades meet; the line to the tip is the x axis."""
     y, across = half.metal / 2, half.metal / 2
     heel = np.array([-0.55 * half.width, y, 0.0])
@@ -93,22 +73,16 @@ def _blade(half: _Half) -> list[Solid]:
     point = np.array([reach, y, 0.0])
     wide = half.width / 2
     waist = wide + (half.tip / 2 - wide) * 0.45 * half.belly
-    solids = [
-        beam(heel, neck, (wide, across), _Y, (waist / wide, 1.0)),
-        beam(neck, point, (waist, across), _Y, (half.tip / 2 / waist, 1.0)),
-    ]
+    yield beam(heel, neck, (wide, across), UP, (waist / wide, 1.0))
+    yield beam(neck, point, (waist, across), UP, (half.tip / 2 / waist, 1.0))
     if half.round_tip:
-        solids.append(cylinder(point, (half.tip / 2, half.tip / 2, across), _FLAT))
+        yield cylinder(point, (half.tip / 2, half.tip / 2, across), TURN_Y)
     radius, height = half.screw
-    solids.append(
-        cylinder(
-            (0, half.metal / 2 + height / 2, 0), (radius, radius, (half.metal + height) / 2), _FLAT
-        )
-    )
-    return solids
+    extents = (radius, radius, (half.metal + height) / 2)
+    yield cylinder((0, half.metal / 2 + height / 2, 0), extents, TURN_Y)
 
 
-def _loop(half: _Half) -> tuple[list[Solid], np.ndarray]:
+def _loop(half: _Half) -> tuple[Iterable[Solid], np.ndarray]:
     """The loop for the fingers, and the corners [n, 3] of its middle line."""
     turn = 2 * np.pi * np.arange(12) / 12
     a, b = half.loop[0] + half.tube[0], half.loop[1] + half.tube[0]
@@ -122,39 +96,39 @@ def _loop(half: _Half) -> tuple[list[Solid], np.ndarray]:
     center = np.array([-half.shank, 0.0, -half.gap]) - (bulge, 0.0, bulge) - middle.max(axis=0)
     middle = middle + center
     if not half.ring:
-        return chain(middle, half.tube, _Y, closed=True, round_=True), middle
-    turn_flat = splay @ _FLAT
+        return chain(middle, half.tube, UP, closed=True, round_=True), middle
+    turn_flat = splay @ TURN_Y
     outer = (a + half.tube[0], b + half.tube[0], half.tube[1])
     hole = cylinder(center, (*half.loop, 2 * half.tube[1]), turn_flat)
     return [cylinder(center, outer, turn_flat, hole)], middle
 
 
-def _handle(half: _Half) -> list[Solid]:
-    """Shank, sheath, loop and what is on them."""
-    solids, middle = _loop(half)
+def _handle(half: _Half) -> Iterator[Solid]:
+    """Shank, sheath, loop and what is on them, in line with the blade (before the bend)."""
+    loop, middle = _loop(half)
+    yield from loop
     width = half.sheath[0] if half.sheath else 0.3 * half.width
     start = np.array([-0.3 * half.width, half.metal / 2, 0.0])
     # Behind the pivot the shank bends to its own side of the middle.
     elbow = np.array([-0.35 * half.shank - 0.3 * half.width, 0.0, -half.gap - width])
     nearest = middle[np.argmin(np.linalg.norm(middle - elbow, axis=1))]
     tang = (0.36 * half.width, half.metal / 2)
-    solids.append(beam(start, elbow + (0, half.metal / 2, 0), tang, _Y))
+    yield beam(start, elbow + (0, half.metal / 2, 0), tang, UP)
     way = nearest - elbow
     if half.sheath:
         taper = np.minimum(1.0, np.array(half.tube) / half.sheath)
-        solids.append(beam(elbow - 0.1 * way, nearest, half.sheath, _Y, taper))
+        yield beam(elbow - 0.1 * way, nearest, half.sheath, UP, taper)
     else:
         thick = max(half.metal / 2, 0.7 * half.tube[1])
-        solids.append(beam(elbow - 0.1 * way, nearest, (width, thick), _Y, (0.8, 1.0)))
+        yield beam(elbow - 0.1 * way, nearest, (width, thick), UP, (0.8, 1.0))
     for tooth in range(half.teeth):
         place = elbow + way * (0.3 + 0.35 * tooth) + (0, 0, 0.45 * width)
         size = (0.12 * np.abs(way[0]), 0.5 * half.tube[1], 0.5 * width)
-        solids.append(box(place, size))
+        yield box(place, size)
     if half.rest:
         end = middle[np.argmin(middle[:, 0])]
         out = np.array([-0.9 * half.rest, 0.0, -0.45 * half.rest])
-        solids.append(beam(end, end + out, half.tube, _Y, round_=True))
-    return [rotated(solid, about("y", half.bend)) for solid in solids]
+        yield beam(end, end + out, half.tube, UP, round_=True)
 
 
 def _office(rng: np.random.Generator) -> tuple[_Half, _Half]:
@@ -322,21 +296,19 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     kind = _KINDS[rng.choice(len(_KINDS), p=_SHARES)]
     root_half, other_half = kind(rng)
     other_half = replace(other_half, bend=-other_half.bend)  # the same way, after the half turn
-    root = _blade(root_half) + _handle(root_half)
-    other = [rotated(solid, _HALF_TURN) for solid in _blade(other_half) + _handle(other_half)]
-    parts = [
-        [rotated(solid, about("y", angle)) for solid in solids]
-        for solids, angle in ((root, -_REST / 2), (other, _REST / 2))
-    ]
+    parts = []
+    for half, side, angle in (
+        (root_half, np.eye(3), -_REST / 2),
+        (other_half, _HALF_TURN, _REST / 2),
+    ):
+        handle = (rotated(solid, about("y", half.bend)) for solid in _handle(half))
+        half_turned = (rotated(solid, side) for solid in (*_blade(half), *handle))
+        parts.append([rotated(solid, about("y", angle)) for solid in half_turned])
     if rng.random() < 0.1:
         parts = [[mirrored(solid, "y") for solid in part] for part in parts]
     widest = rng.uniform(np.radians(42), _WIDE)
-    return ObjectModel(
-        parts,
-        _Y[None],
-        np.zeros((1, 3)),
-        np.array([(_CLOSED - _REST, widest - _REST)]),
-    )
+    limits = np.array([(_CLOSED - _REST, widest - _REST)])
+    return ObjectModel(parts, np.array([UP]), np.zeros((1, 3)), limits)
 
 
 def _file_axes(rest: RestObject, where: str) -> AxisMap:

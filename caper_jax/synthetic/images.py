@@ -65,10 +65,7 @@ def render_image(
     Raises:
       CaperError: unknown noise preset.
     """
-    sensor = _sensor(noise)
-    depth, parts, intrinsics, pose = _render(key, instance, sensor, category, width, height)
-    pose = jax.tree.map(np.asarray, pose)
-    return Image(np.asarray(depth), np.asarray(parts), np.asarray(intrinsics, np.float64), pose)
+    return _image(*_render(key, instance, _sensor(noise), category, width, height))
 
 
 def render_pose(
@@ -98,10 +95,12 @@ def render_pose(
       CaperError: unknown noise preset.
     """
     camera = jnp.asarray(intrinsics, jnp.float32)
-    depth, parts = _look(
-        key, instance, poses, _sensor(noise), camera, category, width=width, height=height
-    )
-    pose = jax.tree.map(np.asarray, articulated_pose(instance, state, poses))
+    depth, parts = _look(key, instance, poses, _sensor(noise), camera, category, width, height)
+    return _image(depth, parts, intrinsics, articulated_pose(instance, state, poses))
+
+
+def _image(depth, parts, intrinsics, pose: ArticulatedPose) -> Image:
+    pose = jax.tree.map(np.asarray, pose)
     return Image(np.asarray(depth), np.asarray(parts), np.asarray(intrinsics, np.float64), pose)
 
 
@@ -119,13 +118,11 @@ def _render(key, instance: InstanceBank, sensor, category: Category, width: int,
     reach = jnp.maximum(jnp.abs(low), jnp.abs(high)) / jnp.array([width, height])
     focal = jax.random.uniform(keys[1], minval=0.85, maxval=1.25) * width
     focal = jnp.minimum(focal, 0.46 / reach.max())
-    center = jnp.array([width, height]) / 2 + jax.random.uniform(
-        keys[2], (2,), minval=-0.01, maxval=0.01
-    ) * jnp.array([width, height])
+    size = jnp.array([width, height])
+    shift = jax.random.uniform(keys[2], (2,), minval=-0.01, maxval=0.01)
+    center = size / 2 + shift * size
     intrinsics = jnp.array([[focal, 0.0, center[0]], [0.0, focal, center[1]], [0.0, 0.0, 1.0]])
-    depth, parts = _look(
-        keys[3], instance, poses, sensor, intrinsics, category, width=width, height=height
-    )
+    depth, parts = _look(keys[3], instance, poses, sensor, intrinsics, category, width, height)
     return depth, parts, intrinsics, articulated_pose(instance, state, poses)
 
 
@@ -232,10 +229,10 @@ def _images(
     move = _fit(key, corners.reshape(-1, 3), intrinsics, size)
     moved = jnp.asarray(move @ np.asarray(root, np.float64), jnp.float32)
     poses = np.asarray(_part_poses(moved, instance, states, category))
-    look = partial(render_pose, category=category, noise=noise, intrinsics=intrinsics)
     for index, state in enumerate(states):
-        yield look(
-            jax.random.fold_in(key, index), instance, state, poses[index], width=size, height=size
+        frame_key = jax.random.fold_in(key, index)
+        yield render_pose(
+            frame_key, instance, state, poses[index], category, noise, intrinsics, size, size
         )
 
 

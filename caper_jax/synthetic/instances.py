@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import flax.struct
@@ -73,10 +73,6 @@ class InstanceBank:
         return self.size.shape[0]
 
 
-def _group_name(solid: Solid) -> str:
-    return solid.kind if solid.hole is None else f"{solid.kind}-{solid.hole.kind}"
-
-
 def draw_instances(category: Category, count: int, split: str, seed: int) -> list[ObjectModel]:
     """``count`` instances of a category; other splits and seeds give other instances.
 
@@ -120,33 +116,18 @@ def split_key(split: str, seed: int) -> PRNGKeyArray:
 
 def build_bank(models: list[ObjectModel]) -> InstanceBank:
     """Packs models (origins already centered) into one InstanceBank of float32 numpy arrays."""
-    kinds: dict[str, Solid] = {}
-    slots: Counter[tuple[str, int]] = Counter()  # of a kind and a part: the most of any instance
-    for model in models:
-        used: Counter[tuple[str, int]] = Counter()
-        for part, solids in enumerate(model.parts):
-            for solid in solids:
-                kinds.setdefault(_group_name(solid), solid)
-                used[_group_name(solid), part] += 1
-        slots |= used
-    groups, first = {}, {}
-    for name in sorted(kinds):
-        order = sorted(part for key, part in slots.elements() if key == name)
-        # Never a single slot: XLA merges a loop of one turn into what uses its result, where it
-        # costs more than a further slot.
-        order = order if len(order) > 1 else 2 * order
-        groups[name] = _empty_group(kinds[name], len(models), tuple(order))
-        first.update({(name, part): order.index(part) for part in set(order)})
+    # Of each kind, the solids of each part of each model.
+    found: dict[str, list[list[list[Solid]]]] = {}
     for index, model in enumerate(models):
-        free = dict(first)
         for part, solids in enumerate(model.parts):
             for solid in solids:
-                name = _group_name(solid)
-                _fill_slot(groups[name], index, free[name, part], solid)
-                free[name, part] += 1
+                name = solid.kind if solid.hole is None else f"{solid.kind}-{solid.hole.kind}"
+                if name not in found:
+                    found[name] = [[[] for _ in model.parts] for _ in models]
+                found[name][index][part].append(solid)
     boxes = np.array([[bounds(part) for part in model.parts] for model in models])
     return InstanceBank(
-        groups=groups,
+        groups={name: _group(found[name]) for name in sorted(found)},
         joint_axis=np.array([model.axis for model in models], np.float32),
         joint_pivot=np.array([model.pivot for model in models], np.float32),
         limits=np.array([model.limits for model in models], np.float32),
@@ -155,37 +136,40 @@ def build_bank(models: list[ObjectModel]) -> InstanceBank:
     )
 
 
-def _empty_group(like: Solid, count: int, part: tuple[int, ...]) -> SolidGroup:
-    """Free slots, one for each entry of ``part``, for solids of the kind of ``like``."""
-    slots = len(part)
-    eye = np.tile(np.eye(3, dtype=np.float32), (count, slots, 1, 1))
-    zeros = np.zeros((count, slots, 3), np.float32)
-    ones = np.ones((count, slots, 2), np.float32)
+def _group(models: list[list[list[Solid]]]) -> SolidGroup:
+    """Packs the solids of one kind of each part of each model."""
+    # Of each part, as many slots as any model needs.
+    slots = [max(map(len, solids)) for solids in zip(*models, strict=True)]
+    if sum(slots) == 1:
+        # Never a single slot: XLA merges a loop of one turn into what uses its result, where it
+        # costs more than a further slot.
+        slots[slots.index(1)] = 2
+    rows: list[list[Solid | None]] = [[] for _ in models]
+    for row, parts in zip(rows, models, strict=True):
+        for solids, count in zip(parts, slots, strict=True):
+            row += [*solids, *[None] * (count - len(solids))]
+    like = next(solid for row in rows for solid in row if solid is not None)
     hole = None if like.hole is None else like.hole.kind
+
+    def pack(value: Callable[[Any], Any], free: np.ndarray) -> np.ndarray:
+        """A value of every solid, ``free`` in free slots."""
+        values = [[free if solid is None else value(solid) for solid in row] for row in rows]
+        return np.array(values, np.float32)
+
+    def to_unit(solid: Any) -> np.ndarray:
+        return solid.rotation.T / solid.half[:, None]
+
+    eye, zeros, ones = np.eye(3), np.zeros(3), np.ones(2)
     return SolidGroup(
-        to_unit=eye.copy(),
-        center=zeros.copy(),
-        half_axes=np.zeros_like(eye),
-        valid=np.zeros((count, slots), bool),
-        taper=ones.copy() if like.kind in TAPERED else None,
-        hole_to_unit=eye.copy() if hole else None,
-        hole_center=zeros.copy() if hole else None,
-        hole_taper=ones.copy() if hole in TAPERED else None,
-        part=part,
+        to_unit=pack(to_unit, eye),
+        center=pack(lambda solid: solid.center, zeros),
+        half_axes=pack(lambda solid: solid.rotation * solid.half, np.zeros((3, 3))),
+        valid=np.array([[solid is not None for solid in row] for row in rows]),
+        taper=pack(lambda solid: solid.taper, ones) if like.kind in TAPERED else None,
+        hole_to_unit=pack(lambda solid: to_unit(solid.hole), eye) if hole else None,
+        hole_center=pack(lambda solid: solid.hole.center, zeros) if hole else None,
+        hole_taper=pack(lambda solid: solid.hole.taper, ones) if hole in TAPERED else None,
+        part=tuple(part for part, count in enumerate(slots) for _ in range(count)),
         kind=like.kind,
         hole=hole,
     )
-
-
-def _fill_slot(group: SolidGroup, index: int, slot: int, solid: Solid) -> None:
-    group.to_unit[index, slot] = solid.rotation.T / solid.half[:, None]
-    group.center[index, slot] = solid.center
-    group.half_axes[index, slot] = solid.rotation * solid.half
-    group.valid[index, slot] = True
-    if group.taper is not None:
-        group.taper[index, slot] = solid.taper
-    if solid.hole is not None:
-        group.hole_to_unit[index, slot] = solid.hole.rotation.T / solid.hole.half[:, None]
-        group.hole_center[index, slot] = solid.hole.center
-        if group.hole_taper is not None:
-            group.hole_taper[index, slot] = solid.hole.taper

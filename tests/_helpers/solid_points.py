@@ -59,30 +59,25 @@ def loose(solids: list[Solid], slack: float = 1e-3) -> list[int]:
     first.
     """
     rng = np.random.default_rng(0)
-    rest = dict(enumerate(solids))
-    reached = [rest.pop(0)]
+    extents = [np.array(solid.extent()) for solid in solids]
+    surfaces = [_surface(rng, solid, 1500) for solid in solids]
+
+    def touch(one: int, other: int) -> bool:
+        low = np.maximum(extents[one][0], extents[other][0]) - slack
+        high = np.minimum(extents[one][1], extents[other][1]) + slack
+        points = np.concatenate([surfaces[one], surfaces[other]])
+        points = points[((points >= low) & (points <= high)).all(1)]
+        for solid in (solids[one], solids[other]):
+            points = points[_depth(solid, points) > -slack]
+            if solid.hole is not None:
+                points = points[_depth(solid.hole, points) < slack]
+        return len(points) > 0
+
+    rest, reached = set(range(1, len(solids))), [0]
     while reached and rest:
-        touching = [
-            index
-            for index, solid in rest.items()
-            if any(_touch(rng, solid, other, slack) for other in reached)
-        ]
-        reached = [rest.pop(index) for index in touching]
-    return list(rest)
-
-
-def _touch(rng: np.random.Generator, one: Solid, other: Solid, slack: float) -> bool:
-    (low, high), (other_low, other_high) = one.extent(), other.extent()
-    low, high = np.maximum(low, other_low) - slack, np.minimum(high, other_high) + slack
-    if (low > high).any():
-        return False
-    points = np.concatenate([_surface(rng, one, 1500), _surface(rng, other, 1500)])
-    near = np.ones(len(points), bool)
-    for solid in (one, other):
-        near &= _depth(solid, points) > -slack
-        if solid.hole is not None:
-            near &= _depth(solid.hole, points) < slack
-    return bool(near.any())
+        reached = [index for index in rest if any(touch(index, other) for other in reached)]
+        rest.difference_update(reached)
+    return sorted(rest)
 
 
 def _surface(rng: np.random.Generator, solid: Solid, count: int) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from _helpers import microwave, tiny
 from _helpers.frames import random_frames
+from _helpers.shapes import outside_part
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
@@ -54,11 +55,7 @@ def test_the_command_draws_frames_of_it(tmp_path):
         frame = dataset[index]
         pose, labels = frame.truth, frame.labels
         assert set(np.unique(labels)) <= {0, 1} and (labels == 0).any()
-        # Undo the poses: what is seen of a part lies in its box at rest.
-        offset = frame.points - pose.translation[labels]
-        local = np.einsum("nji,nj->ni", pose.rotation[labels], offset)
-        outside = np.abs(local - pose.box_center[labels]) - pose.size[labels] / 2
-        assert outside.max() < 2e-4
+        assert outside_part(pose, frame.points, labels).max() < 2e-4
         # The door turns against the body by the state, about the joint.
         turn = Rotation.from_rotvec(pose.joint_axis[0] * pose.joint_state[0]).as_matrix()
         np.testing.assert_allclose(pose.rotation[0].T @ pose.rotation[1], turn, atol=1e-5)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from _helpers.solid_points import inside, loose
+from _helpers.shapes import boxes, kinds, sample
+from _helpers.solid_points import inside
 
 from caper_jax import categories
-from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.instances import draw_instances
 
 # Length, height and width of the body, and length and width of the blade with its carrier, of the
@@ -30,25 +30,9 @@ def cutters():
     return draw_instances(categories.get("cutter"), 200, "train", 3)
 
 
-def boxes(model):
-    return np.array([bounds(part) for part in model.parts])
-
-
-def sample(rng, solid, count):
-    """[N, 3] points in the solid."""
-    drawn = solid.center + (rng.uniform(-1, 1, (count, 3)) * solid.half) @ solid.rotation.T
-    return drawn[inside(solid, drawn)]
-
-
 def slides_on_the_edge(model):
     body, blade = boxes(model)
     return blade[0, 2] < body[0, 2]
-
-
-def test_numbers_keep_their_meaning():
-    category = categories.get("cutter")
-    assert category.parts == ("body", "blade") and category.directions == ("x", "y")
-    assert category.joint_types == ("prismatic",) and category.parents == (0,)
 
 
 def test_the_blade_rests_in_the_body_and_comes_out_along_x(cutters):
@@ -84,7 +68,7 @@ def test_the_slider_stands_out_of_the_flat_face_or_the_narrow_side(cutters):
 def test_the_slider_passes_everything_on_the_body(cutters):
     rng = np.random.default_rng(0)
     for model in cutters:
-        points = np.concatenate([sample(rng, solid, 40) for solid in model.parts[1][3:]])
+        points = sample(rng, model.parts[1][3:], 40)
         for state in np.linspace(0, model.limits[0, 1], 5):
             at = points + model.axis[0] * state
             assert not any(inside(solid, at, 1e-4).any() for solid in model.parts[0])
@@ -93,7 +77,7 @@ def test_the_slider_passes_everything_on_the_body(cutters):
 def test_the_tip_is_cut_at_an_angle(cutters):
     for model in cutters:
         plate = model.parts[1][0]
-        points = sample(np.random.default_rng(0), plate, 4000)
+        points = sample(np.random.default_rng(0), [plate], 4000)
         across = (points[:, 2] - plate.center[2]) / plate.half[2]
         reach = [points[np.abs(across - side) < 0.2, 0].max() for side in (-0.9, 0.9)]
         assert abs(reach[1] - reach[0]) > 0.3 * plate.half[2]
@@ -107,13 +91,11 @@ def test_sizes_are_those_of_real_cutters(cutters):
     assert (width < 0.014).sum() > 40 and (width > 0.016).sum() > 80  # slim and wide blades
 
 
-def test_every_measured_cutter_has_one_like_it():
-    models = draw_instances(categories.get("cutter"), 1000, "train", 0)
-    size = np.array([np.ptp(boxes(model), axis=1) for model in models])
+def test_every_measured_cutter_has_one_like_it(cutters):
+    size = np.array([np.ptp(boxes(model), axis=1) for model in cutters])
     drawn = np.concatenate([size[:, 0], size[:, 1, [0, 2]]], axis=-1)
     ratio = np.abs(np.log(drawn[:, None] / (np.array(MEASURED) / 1000))).max(-1).min(0)
-    # One of them has a blade short and broad beyond any other; it is matched less closely.
-    assert np.sort(ratio)[-2] < 0.16 and ratio.max() < 0.25
+    assert ratio.max() < 0.16
 
 
 def test_travels_cover_the_measured_ones(cutters):
@@ -121,28 +103,13 @@ def test_travels_cover_the_measured_ones(cutters):
     assert ((high > 0.065) & (high < 0.1)).sum() > 50
 
 
-def test_each_part_is_one_piece(cutters):
-    for model in cutters[:60]:
-        for part in model.parts:
-            assert not loose(part)
-
-
 def test_all_kinds_occur(cutters):
     """Flat, round, tapered and bellied bodies; sleeves, noses, round ends, lanyard holes."""
-    kinds = [
-        {(s.kind, s.hole.kind if s.hole else None) for s in model.parts[0]} for model in cutters
-    ]
-    for kind, least in (
-        (("box", "box"), 80),
-        (("cylinder", "box"), 20),
-        (("cylinder", None), 40),
-        (("frustum", "box"), 15),
-        (("frustum", None), 15),
-        (("cone", None), 4),
-        (("ellipsoid", "box"), 4),
-        (("cylinder", "cylinder"), 4),
-    ):
-        assert sum(kind in row for row in kinds) >= least, kind
+    bodies = [kinds(model.parts[0]) for model in cutters]
+    least = {"box-box": 80, "cylinder-box": 20, "cylinder": 40, "frustum-box": 15, "frustum": 15}
+    least |= {"cone": 4, "ellipsoid-box": 4, "cylinder-cylinder": 4}
+    for kind, count in least.items():
+        assert sum(kind in row for row in bodies) >= count, kind
     sliders = [[s.kind for s in model.parts[1][3:]] for model in cutters]
     for kind in ("ellipsoid", "frustum", "cylinder", "box"):
         assert sum(kind in row for row in sliders) > 15, kind

@@ -82,7 +82,7 @@ def test_beams_reach_from_start_to_end(taper, round_, kind):
 @pytest.mark.parametrize("closed", [False, True])
 def test_chains_follow_their_points_without_gaps(closed):
     points = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    solids = chain(points, (0.1, 0.05), (0.0, 0.0, 1.0), closed)
+    solids = list(chain(points, (0.1, 0.05), (0.0, 0.0, 1.0), closed))
     assert len(solids) == (4 if closed else 3) and not loose(solids)
     np.testing.assert_allclose(bounds(solids)[0][2], -0.05)
     middles = (points + np.roll(points, -1, axis=0)) / 2

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from _helpers.solid_points import deepest_overlap, loose
+from _helpers.shapes import boxes
+from _helpers.solid_points import deepest_overlap
 from scipy.spatial.transform import Rotation
 
-from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.categories.robotarm import _FAMILIES, ROBOTARM, chains
 from caper_jax.geometry.solids import bounds
 from caper_jax.synthetic.instances import draw_instances
@@ -76,16 +76,11 @@ class Settled:
         return self.chance
 
 
-def dh_flange(table, angles):
-    """[4, 4] of a standard DH chain, the angles over those at zero."""
+def screw(axis, angle, shift):
+    """[4, 4] turn about a coordinate axis and shift along it."""
     pose = np.eye(4)
-    for (zero, d, a, alpha), angle in zip(table, angles, strict=True):
-        turn, step = np.eye(4), np.eye(4)
-        turn[:3, :3] = Rotation.from_euler("z", zero + angle).as_matrix()
-        turn[2, 3] = d
-        step[:3, :3] = Rotation.from_euler("x", alpha).as_matrix()
-        step[0, 3] = a
-        pose = pose @ turn @ step
+    pose[:3, :3] = Rotation.from_euler(axis, angle).as_matrix()
+    pose["xyz".index(axis), 3] = shift
     return pose
 
 
@@ -120,7 +115,9 @@ def test_flanges_go_where_published_kinematics_puts_them(name):
     rng = np.random.default_rng(0)
     offsets = []
     for states in (np.zeros(6), *rng.uniform(-2, 2, (5, 6))):
-        published = dh_flange(table, np.array(signs) * states)
+        published = np.eye(4)
+        for (zero, d, a, alpha), angle in zip(table, np.array(signs) * states, strict=True):
+            published = published @ screw("z", zero + angle, d) @ screw("x", alpha, a)
         last = link_poses(axes, pivots, states)[-1]
         ours = to_base @ (last[:3, :3] @ flange + last[:3, 3])
         np.testing.assert_allclose(to_base @ last[:3, :3] @ chain.tip, published[:3, 2], atol=1e-12)
@@ -145,12 +142,7 @@ def test_the_panda_is_the_published_one(chance):
         angles[moving] = signs * states
         pose = np.eye(4)
         for (alpha, a), d, angle in zip(before, along, angles, strict=True):
-            step, turn = np.eye(4), np.eye(4)
-            step[:3, :3] = Rotation.from_euler("x", alpha).as_matrix()
-            step[0, 3] = a
-            turn[:3, :3] = Rotation.from_euler("z", angle).as_matrix()
-            turn[2, 3] = d
-            pose = pose @ step @ turn
+            pose = pose @ screw("x", alpha, a) @ screw("z", angle, d)
         published = pose @ [0, 0, 0.107, 1]
         last = link_poses(axes, pivots, states)[-1]
         ours = to_base @ (last[:3, :3] @ chain.paths[-1][-1] + last[:3, 3])
@@ -158,62 +150,12 @@ def test_the_panda_is_the_published_one(chance):
         np.testing.assert_allclose(to_base @ last[:3, :3] @ chain.tip, pose[:3, 2], atol=1e-9)
 
 
-def test_chains_move_as_a_robot_description_says(arms):
-    """Poses of all seven links against yourdfpy, from a URDF of the same joints."""
-    yourdfpy = pytest.importorskip("yourdfpy")
-    from lxml import etree
-
-    model = arms[0]
-    origins = np.diff(np.concatenate([np.zeros((1, 3)), model.pivot]), axis=0)
-    robot = etree.Element("robot", name="arm")
-    for k in range(7):
-        etree.SubElement(robot, "link", name=f"link{k}")
-    for j in range(6):
-        joint = etree.SubElement(robot, "joint", name=f"joint{j}", type="revolute")
-        etree.SubElement(joint, "parent", link=f"link{j}")
-        etree.SubElement(joint, "child", link=f"link{j + 1}")
-        etree.SubElement(joint, "origin", xyz=" ".join(map(repr, map(float, origins[j]))))
-        etree.SubElement(joint, "axis", xyz=" ".join(map(repr, map(float, model.axis[j]))))
-        etree.SubElement(joint, "limit", lower="-9", upper="9", effort="1", velocity="1")
-    described = yourdfpy.URDF(
-        robot=yourdfpy.URDF._parse_robot(robot), build_scene_graph=True, load_meshes=False
-    )
-    states = np.random.default_rng(2).uniform(*model.limits.T)
-    described.update_cfg(states)
-    poses = np.asarray(
-        forward_kinematics(
-            np.eye(4, dtype=np.float32),
-            model.axis.astype(np.float32),
-            model.pivot.astype(np.float32),
-            states.astype(np.float32),
-            ROBOTARM.joint_types,
-            ROBOTARM.parents,
-        )
-    )
-    for k in range(7):
-        expected = described.get_transform(f"link{k}", "link0")
-        if k:  # its frame sits on the joint
-            expected = expected @ [
-                *np.hstack([np.eye(3), -model.pivot[k - 1][:, None]]),
-                [0, 0, 0, 1],
-            ]
-        np.testing.assert_allclose(poses[k], expected, atol=2e-6)
-
-
-def test_numbers_keep_their_meaning(arms):
-    assert ROBOTARM.num_parts == 7 and ROBOTARM.parts[0] == "base"
-    assert ROBOTARM.joint_types == ("revolute",) * 6
-    assert ROBOTARM.parents == (0, 1, 2, 3, 4, 5)
-    assert ROBOTARM.directions == ("y", "z")
-    assert all(len(model.parts) == 7 and all(model.parts) for model in arms)
-
-
 def test_rest_frames_and_signs(arms):
     """y up from the base, z forward; axes along positive canonical ones; the first is vertical."""
     for model in arms:
         np.testing.assert_array_equal(np.sort(model.axis, axis=1), [[0, 0, 1]] * 6)
         np.testing.assert_array_equal(model.axis[:2], [[0, 1, 0], [1, 0, 0]])
-        low, high = np.array([bounds(part) for part in model.parts]).transpose(1, 0, 2)
+        low, high = boxes(model).transpose(1, 0, 2)
         column = model.pivot[0]
         assert low[0, 1] <= low[:, 1].min() + 0.06  # nothing reaches far below the foot
         assert low[0, 1] < column[1] < high[0, 1] + 1e-9
@@ -225,25 +167,17 @@ def test_rest_frames_and_signs(arms):
 
 def test_joints_sit_where_their_links_meet(arms):
     for model in arms[:60]:
-        boxes = np.array([bounds(part) for part in model.parts])
+        low, high = boxes(model).transpose(1, 0, 2)
         for j, pivot in enumerate(model.pivot):
             for part in (j, j + 1):
-                outside = np.maximum(boxes[part, 0] - pivot, pivot - boxes[part, 1]).max()
-                assert outside < 0.005
-
-
-def test_each_link_is_one_piece(arms):
-    for model in arms[:40]:
-        assert [k for k, part in enumerate(model.parts) if loose(part)] == []
+                assert np.maximum(low[part] - pivot, pivot - high[part]).max() < 0.005
 
 
 def test_sizes_are_those_of_real_arms(arms):
     reach, thick = [], []
     for model in arms:
-        pivots = model.pivot
-        reach.append(np.linalg.norm(np.diff(pivots, axis=0), axis=1).sum())
-        size = np.diff([bounds(part) for part in model.parts], axis=1)[:, 0]
-        thick.append(np.sort(size[2])[:2].min())  # of the upper arm, at its joints
+        reach.append(np.linalg.norm(np.diff(model.pivot, axis=0), axis=1).sum())
+        thick.append(np.ptp(boxes(model)[2], axis=0).min())  # of the upper arm, at its joints
     assert 0.35 < min(reach) < 0.7 and 1.1 < max(reach) < 2.4
     assert min(thick) > 0.03 and max(thick) < 0.35
 
@@ -292,7 +226,7 @@ def test_all_kinds_occur(arms):
     assert any(hand[-1] == "cone" for hand in hands)
     assert any(hand[-1] == "cylinder" for hand in hands)
     # Stretched out, upright, or bent at rest.
-    shapes = [np.ptp([bounds(part) for part in model.parts[1:]], axis=(0, 1)) for model in arms]
+    shapes = [np.ptp(boxes(model)[1:], axis=(0, 1)) for model in arms]
     slender = [size[1] / size[2] for size in shapes]
     assert min(slender) < 0.6 and max(slender) > 4.0
 

@@ -1,8 +1,6 @@
-"""The ray caster: every kind of solid and every difference of two, against Embree and float64."""
+"""The ray caster: every kind of solid and differences of two, against float64."""
 
 from __future__ import annotations
-
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +17,9 @@ from caper_jax.synthetic.ray_casting import FAR, cast, part_depths, projected_bo
 
 KINDS = ("box", "cylinder", "ellipsoid", "frustum", "cone")
 FLAT = ("box", "frustum")
-PAIRS = [(kind, None) for kind in KINDS] + list(itertools.product(KINDS, KINDS))
+# The caster treats a solid and its hole apart: every kind twice as either is enough.
+PAIRS = [(kind, None) for kind in KINDS] + list(zip(KINDS, KINDS, strict=True))
+PAIRS += list(zip(KINDS, (*KINDS[2:], *KINDS[:2]), strict=True))
 IDS = ["-".join(filter(None, pair)) for pair in PAIRS]
 DRAWS = 2  # random solids per pair
 SIDE = 72  # rays per side
@@ -184,28 +184,6 @@ def test_agrees_with_the_definition_in_float64(scene, index):
     assert np.median(errors) < 3e-7
     # What grazes a surface or passes an edge of the hole may be farther off.
     assert (errors > 1e-5).mean() < 1e-3
-
-
-@pytest.mark.parametrize("index", range(len(PAIRS)), ids=IDS)
-def test_agrees_with_embree(scene, index):
-    trimesh = pytest.importorskip("trimesh")
-    pytest.importorskip("embreex")
-    pytest.importorskip("manifold3d")
-    from _helpers.solid_meshes import part_mesh
-
-    flat = all(kind is None or kind in FLAT for kind in PAIRS[index])
-    solid, pose, rays, depth = scene.view(0, index)
-    mesh = part_mesh([solid])
-    origin = np.tile(-pose[:3, :3].T @ pose[:3, 3], (len(rays), 1))
-    caster = trimesh.ray.ray_pyembree.RayMeshIntersector(mesh)
-    place, ray, _ = caster.intersects_location(origin, rays @ pose[:3, :3], multiple_hits=False)
-    expected = np.full(len(rays), FAR)
-    expected[ray] = (place @ pose[:3, :3].T + pose[:3, 3])[:, 2]
-    both = (depth < FAR) & (expected < FAR)
-    assert both.sum() > 100
-    assert ((depth < FAR) == (expected < FAR)).mean() >= 0.999
-    # 512 sections of a radius of 0.1 m: chords lie up to 2 micrometers inside the surface.
-    assert np.median(np.abs(depth - expected)[both]) < (1e-6 if flat else 4e-6)
 
 
 def test_nearest_part_wins_and_parts_are_seen_alone():

@@ -5,11 +5,12 @@ Measured with the door shut: floor at y = 0, opening at z = 0, x centered.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from caper_jax.categories.forms import TURN_X, TURN_Y, about, stand
+from caper_jax.categories.forms import TURN_X, TURN_Y, about, open_box, stand
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid
 
 # Probability, and ranges of width, height (without worktop) and depth in meters.
@@ -24,36 +25,23 @@ _GAP = 0.004  # between the door and what is around it, meters
 
 @dataclass(frozen=True)
 class Plan:
-    """Measures in meters, door shut; x centered.
+    """Measures in meters, door shut; x centered."""
 
-    Attributes:
-      width, height, depth: outer extents; the height counts from the floor.
-      base: lower edge of the tub; below it only the plinth.
-      side, floor, back: thickness of the tub's walls.
-      ceiling: y of the upper edge of the opening.
-      thick: of the door's plate.
-      half_door: half its width.
-      low, high: y of its lower and upper edge.
-      hinge: (y, z).
-      recess: how far the plinth must stand back to let the door's lower edge pass.
-      plug: depth of the door's inner panel, which lies in the opening; 0 for none.
-    """
-
-    width: float
+    width: float  # outer extents; the height counts from the floor
     height: float
     depth: float
-    base: float
-    side: float
+    base: float  # lower edge of the tub; below it only the plinth
+    side: float  # thickness of the tub's walls
     floor: float
     back: float
-    ceiling: float
-    thick: float
-    half_door: float
-    low: float
+    ceiling: float  # y of the upper edge of the opening
+    thick: float  # of the door's plate
+    half_door: float  # half its width
+    low: float  # y of its lower and upper edge
     high: float
-    hinge: tuple[float, float]
-    recess: float
-    plug: float
+    hinge: tuple[float, float]  # (y, z)
+    recess: float  # how far the plinth must stand back to let the door's lower edge pass
+    plug: float  # depth of the door's inner panel, which lies in the opening; 0 for none
 
     @property
     def cavity(self) -> tuple[np.ndarray, np.ndarray]:
@@ -105,7 +93,7 @@ def draw_plan(rng: np.random.Generator, kind: str, fascia: bool) -> Plan:
     )
 
 
-def body(rng: np.random.Generator, plan: Plan, kind: str, fascia: bool) -> list[Solid]:
+def body(rng: np.random.Generator, plan: Plan, kind: str, fascia: bool) -> Iterator[Solid]:
     low, high = plan.cavity
     half = np.array([plan.width, plan.height - plan.base, plan.depth]) / 2
     center = np.array([0.0, plan.base + half[1], -half[2]])
@@ -116,87 +104,82 @@ def body(rng: np.random.Generator, plan: Plan, kind: str, fascia: bool) -> list[
     backless = rng.random() < 0.05
     if backless:
         low = low - (0, 0, 0.1)
-    solids = [box(center, half, hole=box((low + high) / 2, (high - low) / 2))]
+    yield box(center, half, hole=box((low + high) / 2, (high - low) / 2))
     if housing:
         thick, deep = plan.height - plan.ceiling, rng.uniform(0.03, 0.1)
         for z in (-deep / 2, -plan.depth + plan.back + deep / 2):
-            solids.append(box((0, plan.ceiling + thick / 2, z), (high[0], thick / 2, deep / 2)))
-    solids += _base(rng, plan, kind)
+            yield box((0, plan.ceiling + thick / 2, z), (high[0], thick / 2, deep / 2))
+    yield from _base(rng, plan, kind)
     if fascia:
-        solids += _fascia(rng, plan)
+        yield from _fascia(rng, plan)
     if not housing and rng.random() < {"built_in": 0.2, "table_top": 0.3}.get(kind, 0.6):
-        solids += _worktop(rng, plan, panels=kind == "built_in")
+        yield from _worktop(rng, plan, panels=kind == "built_in")
     if not backless and rng.random() < 0.15:  # connections at the back
         extents = np.array([rng.uniform(0.1, 0.4) * plan.width, rng.uniform(0.03, 0.1), 0.015])
-        solids.append(box((0, plan.base + extents[1] + 0.02, -plan.depth - 0.014), extents))
-    return solids
+        yield box((0, plan.base + extents[1] + 0.02, -plan.depth - 0.014), extents)
 
 
-def _base(rng: np.random.Generator, plan: Plan, kind: str) -> list[Solid]:
+def _base(rng: np.random.Generator, plan: Plan, kind: str) -> Iterator[Solid]:
     """Plinth or feet from the floor to the tub."""
     if kind == "table_top" or rng.random() < 0.25:
         style = rng.choice(("round", "square"))
         room = plan.depth - 1.5 * plan.recess
         feet = stand(rng, style, (plan.width, plan.base, room))
-        return [foot.moved(np.array([0.0, 0.0, room - plan.depth])) for foot in feet]
+        yield from (foot.moved(np.array([0.0, 0.0, room - plan.depth])) for foot in feet)
+        return
     front = -plan.recess - rng.uniform(0.0, 0.06) * (rng.random() < 0.7)
     back = -plan.depth + rng.uniform(0.0, 0.1)
-    half = np.array(
-        [plan.width * rng.uniform(0.46, 0.5), plan.base / 2, (front - back) / 2],
-    )
-    return [box((0, plan.base / 2, (front + back) / 2), half)]
+    half = (plan.width * rng.uniform(0.46, 0.5), plan.base / 2, (front - back) / 2)
+    yield box((0, plan.base / 2, (front + back) / 2), half)
 
 
-def _fascia(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def _fascia(rng: np.random.Generator, plan: Plan) -> Iterator[Solid]:
     """The control strip above the door, part of the body."""
     low, high = plan.high + _GAP, plan.height
     out = plan.thick * rng.uniform(0.6, 1.15) + 0.002
     middle, half = (low + high) / 2, np.array([plan.half_door, (high - low) / 2, out / 2])
-    solids = [box((0, middle, out / 2), half)]
-    return solids + controls(rng, middle, out, half[0], half[1])
+    yield box((0, middle, out / 2), half)
+    yield from controls(rng, middle, out, half[0], half[1])
 
 
 def controls(
     rng: np.random.Generator, y: float, z: float, half_x: float, half_y: float
-) -> list[Solid]:
+) -> Iterator[Solid]:
     """Buttons, a dial or a display on a strip that faces +z."""
-    solids: list[Solid] = []
     radius = min(0.4 * half_y, 0.007)
     start, step = rng.uniform(0.2, 0.5) * half_x, rng.uniform(2.6, 4.0) * radius
     for index in range(rng.integers(0, 4)):
-        solids.append(cylinder((start + index * step, y, z), (radius, radius, 0.003)))
+        yield cylinder((start + index * step, y, z), (radius, radius, 0.003))
     if rng.random() < 0.35:
         dial = min(0.6 * half_y, rng.uniform(0.012, 0.022))
-        solids.append(cylinder((-0.7 * half_x, y, z + 0.005), (dial, dial, 0.009)))
+        yield cylinder((-0.7 * half_x, y, z + 0.005), (dial, dial, 0.009))
     if rng.random() < 0.4:
         place = (rng.uniform(-0.3, 0.0) * half_x, y, z)
-        solids.append(box(place, (0.15 * half_x, 0.5 * half_y, 0.002)))
-    return solids
+        yield box(place, (0.15 * half_x, 0.5 * half_y, 0.002))
 
 
-def _worktop(rng: np.random.Generator, plan: Plan, panels: bool) -> list[Solid]:
+def _worktop(rng: np.random.Generator, plan: Plan, panels: bool) -> Iterator[Solid]:
     """A plate on top, in a kitchen with cabinet sides under it."""
     thick = rng.uniform(0.015, 0.045)
     front = plan.thick * rng.uniform(0.0, 1.4)
     back = -plan.depth - rng.uniform(0.0, 0.03)
     half_x = plan.width / 2 + rng.uniform(0.0, 0.01)
-    sides: list[Solid] = []
-    if panels and rng.random() < 0.6:
-        board = rng.uniform(0.008, 0.012)
+    board = rng.uniform(0.008, 0.012) if panels and rng.random() < 0.6 else 0.0
+    if board:
         half_x = plan.width / 2 + 2 * board + 0.001
+    y = plan.height + thick / 2
+    yield box((0, y, (front + back) / 2), (half_x, thick / 2, (front - back) / 2))
+    if board:
         half = np.array([board, plan.height / 2, plan.depth / 2])
         for side in (-1, 1):
-            sides.append(box((side * (half_x - board), half[1], -half[2]), half))
-    y = plan.height + thick / 2
-    plate = box((0, y, (front + back) / 2), (half_x, thick / 2, (front - back) / 2))
+            yield box((side * (half_x - board), half[1], -half[2]), half)
     if rng.random() < 0.3:
-        sides.append(cylinder((0, y, front), (thick / 2, thick / 2, half_x), TURN_X))
-    return [plate, *sides]
+        yield cylinder((0, y, front), (thick / 2, thick / 2, half_x), TURN_X)
 
 
 def inside(
     rng: np.random.Generator, cavity: tuple[np.ndarray, np.ndarray], plug: float, small: bool
-) -> list[Solid]:
+) -> Iterator[Solid]:
     """Solids in a tub.
 
     Args:
@@ -206,7 +189,7 @@ def inside(
     """
     low, high = cavity
     if rng.random() < 0.08:  # empty
-        return []
+        return
     room = high - low
     front = -plug - rng.uniform(0.02, 0.05)  # clear of the detergent box
     back = low[2] + rng.uniform(0.005, 0.04)
@@ -220,7 +203,6 @@ def inside(
     wires = rng.random() < 0.65
     rim = rng.uniform(0.004, 0.012)
     sides = rng.uniform(0.1, 0.2) if rng.random() < 0.65 else rng.uniform(0.025, 0.06)
-    solids: list[Solid] = []
     racks: list[_Rack] = []
     for level, share in enumerate(floors):
         y = low[1] + share * room[1] + rng.uniform(-0.01, 0.02)
@@ -229,43 +211,29 @@ def inside(
         center = np.array([0.0, y + tall / 2, (front + back) / 2 - pulled])
         half = np.array([half_x, tall / 2, (front - back) / 2 - pulled])
         racks.append(_rack(rng, center, half, rim, wires and level < 2))
-        solids += racks[-1].solids
+        yield from racks[-1].solids
     if rng.random() < 0.45:
-        solids += _plates(rng, racks[0], room[1])
+        yield from _plates(rng, racks[0], room[1])
     if rng.random() < 0.45:
-        solids.append(_cutlery(rng, racks[0], room[1]))
+        yield _cutlery(rng, racks[0], room[1])
     if len(racks) > 1 and rng.random() < 0.35:
-        solids += _cups(rng, racks[1], room[1])
+        yield from _cups(rng, racks[1], room[1])
     if rng.random() < 0.6:  # spray arm over the sump
         reach = 0.85 * min(half_x, (front - back) / 2)
         place = np.array([0.0, low[1] + 0.03, (front + back) / 2])
-        solids.append(box(place, (reach, 0.006, 0.02), about("y", rng.uniform(-1.5, 1.5))))
-        solids.append(cylinder(place - (0, 0.015, 0), (0.05, 0.05, 0.016), TURN_Y))
-    return solids
-
-
-def _basket(center: np.ndarray, half: np.ndarray, wall: float) -> Solid:
-    """An open box."""
-    return box(center, half, hole=box(center + (0, wall, 0), half - (wall, 0, wall)))
+        yield box(place, (reach, 0.006, 0.02), about("y", rng.uniform(-1.5, 1.5)))
+        yield cylinder(place - (0, 0.015, 0), (0.05, 0.05, 0.016), TURN_Y)
 
 
 @dataclass(frozen=True)
 class _Rack:
-    """A rack and where things stand in it.
+    """A rack and where things stand in it."""
 
-    Attributes:
-      solids: all of it.
-      floor: y of what things stand on, meters.
-      places: x of where they can stand.
-      half_x: half its width inside.
-      ends: z of its back and front.
-    """
-
-    solids: list[Solid]
-    floor: float
-    places: np.ndarray
-    half_x: float
-    ends: tuple[float, float]
+    solids: list[Solid]  # all of it
+    floor: float  # y of what things stand on, meters
+    places: np.ndarray  # x of where they can stand
+    half_x: float  # half its width inside
+    ends: tuple[float, float]  # z of its back and front
 
 
 def _rack(
@@ -273,22 +241,20 @@ def _rack(
 ) -> _Rack:
     """A frame with wires, or a tray, on runners that reach the walls of the tub."""
     runner = 0.008
-    solids = [
-        box(center + (side * half[0], 0, 0), (2.5 * runner, runner, half[2])) for side in (-1, 1)
-    ]
+    extents = (2.5 * runner, runner, half[2])
+    solids = [box(center + (side * half[0], 0, 0), extents) for side in (-1, 1)]
     half = half - (runner, 0, 0)
     bottom = center[1] - half[1]
     ends = (center[2] - half[2], center[2] + half[2])
     if not wires:
-        solids.append(_basket(center, half, rim))
+        solids.append(open_box(center, half, rim, rim))
         places = rng.uniform(-0.6, 0.6, size=3) * half[0]
         return _Rack(solids, bottom + rim, places, half[0] - rim, ends)
     count = int(rng.integers(2, 5))
     places = half[0] * (2 * (np.arange(count) + 0.5) / count - 1)
     solids.append(box(center, half, hole=box(center, half + (-rim, 1.0, -rim))))
-    solids += [
-        box((x, bottom + 0.004, center[2]), (rim / 2 + 0.003, 0.004, half[2])) for x in places
-    ]
+    wire = (rim / 2 + 0.003, 0.004, half[2])
+    solids += [box((x, bottom + 0.004, center[2]), wire) for x in places]
     return _Rack(solids, bottom + 0.008, places, half[0] - rim, ends)
 
 
@@ -313,22 +279,19 @@ def _cutlery(rng: np.random.Generator, rack: _Rack, room: float) -> Solid:
     x = rng.choice(rack.places)
     wide = min(wide, rack.half_x - abs(x))
     deep, tall = min(deep, 0.3 * (front - back)), min(tall, 0.15 * room)
-    return _basket(
-        np.array([x, rack.floor + tall, front - deep - 0.012]), np.array([wide, tall, deep]), 0.004
-    )
+    place = (x, rack.floor + tall, front - deep - 0.012)
+    return open_box(place, (wide, tall, deep), 0.004, 0.004)
 
 
-def _cups(rng: np.random.Generator, rack: _Rack, room: float) -> list[Solid]:
+def _cups(rng: np.random.Generator, rack: _Rack, room: float) -> Iterator[Solid]:
     """Cups and bowls, upside down."""
     back, front = rack.ends
-    solids: list[Solid] = []
     for x in rng.permutation(rack.places)[: rng.integers(1, 4)]:
         radius = min(rng.uniform(0.032, 0.06), rack.half_x - abs(x))
         rise = min(rng.uniform(0.03, 0.055), 0.08 * room)
         z = rng.uniform(back + radius + 0.02, front - radius - 0.02)
         place = (x, rack.floor + rise - 0.002, z)
         if rng.random() < 0.6:
-            solids.append(cylinder(place, (radius, radius, rise), TURN_Y))
+            yield cylinder(place, (radius, radius, rise), TURN_Y)
         else:
-            solids.append(ellipsoid(place, (radius, rise, radius)))
-    return solids
+            yield ellipsoid(place, (radius, rise, radius))

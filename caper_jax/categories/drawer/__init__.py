@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from caper_jax.articulation import urdf_rule as urdf
 from caper_jax.articulation.category import Category, Joint, ObjectModel
 from caper_jax.articulation.conversions import (
     ArtImageConversion,
@@ -14,54 +16,30 @@ from caper_jax.articulation.conversions import (
     NotConvertible,
 )
 from caper_jax.articulation.mesh_object import MeshObject
-from caper_jax.articulation.urdf_rule import (
-    CanonicalAxes,
-    UrdfRule,
-    Y,
-    Z,
-    along_positive,
-    closed_states,
-    level,
-    opening_sign,
-    opens_along,
-)
 from caper_jax.categories.drawer import cabinet
 from caper_jax.categories.drawer.cabinet import Plan
-from caper_jax.categories.forms import TURN_Y, Handle, HandleStyle, StandStyle, stand
+from caper_jax.categories.forms import TURN_Y, Handle, HandleStyle, StandStyle, open_box, stand
 from caper_jax.geometry.solids import Solid, box, cylinder, ellipsoid, frustum
 
 
 @dataclass(frozen=True)
 class _Style:
-    """What the three drawers of a cabinet share.
+    """What the three drawers of a cabinet share."""
 
-    Attributes:
-      relief: of the fronts: "plain", "bevel", "panel" (raised), "shaker" (sunk), "bow", "grip" (a
-        recess at the upper edge) or "notch" (an opening there).
-      rim: width of the frame about a panel, meters.
-      depth: of the relief, meters.
-      handle, handle_height: the handle, and where: 0 is the lower edge of a front, 1 the upper.
-      grip: half width of a grip, as a share of the front's width.
-      clearance: beside a tray, meters.
-      tray_height: share of the opening.
-      tray_depth: share of the room behind the front.
-      walls: thickness of a tray's walls and floor, meters.
-      rails: low metal trays with a rail above each side.
-      full: how likely a drawer holds something.
-    """
-
+    # Of the fronts: "plain", "bevel", "panel" (raised), "shaker" (sunk), "bow", "grip" (a recess at
+    # the upper edge) or "notch" (an opening there).
     relief: str
-    rim: float
-    depth: float
+    rim: float  # width of the frame about a panel, meters
+    depth: float  # of the relief, meters
     handle: Handle
-    handle_height: float
-    grip: float
-    clearance: float
-    tray_height: float
-    tray_depth: float
-    walls: float
-    rails: bool
-    full: float
+    handle_height: float  # 0 is the lower edge of a front, 1 the upper
+    grip: float  # half width of a grip, as a share of the front's width
+    clearance: float  # beside a tray, meters
+    tray_height: float  # share of the opening
+    tray_depth: float  # share of the room behind the front
+    walls: float  # thickness of a tray's walls and floor, meters
+    rails: bool  # low metal trays with a rail above each side
+    full: float  # how likely a drawer holds something
 
 
 _RELIEFS = ("plain", "bevel", "panel", "shaker", "bow", "grip", "notch")
@@ -105,7 +83,7 @@ def _style(rng: np.random.Generator, kind: str, plan: Plan) -> _Style:
     )
 
 
-def _front(plan: Plan, style: _Style, index: int) -> list[Solid]:
+def _front(plan: Plan, style: _Style, index: int) -> Iterator[Solid]:
     low, high = plan.front_levels(index)
     back, face = plan.face
     height, half_x = high - low, plan.half_front
@@ -138,16 +116,17 @@ def _front(plan: Plan, style: _Style, index: int) -> list[Solid]:
     if style.relief == "bevel":
         # The edges are broken by about half the thickness.
         taper = 1 - np.minimum(style.depth / half[:2], 0.3)
-        solids = [frustum(center, half, taper)]
+        yield frustum(center, half, taper)
     else:
-        solids = [box(center, half, hole=hole)]
+        yield box(center, half, hole=hole)
     y = min(low + style.handle_height * height, high - min(style.handle.half, 0.4 * height))
     if style.handle.style == "lip":
         y, at = high - min(style.handle.half, 0.1 * height), face - 0.4 * plan.front
-    return solids + extra + style.handle.on((0, y, at), 2 * half_x, height)
+    yield from extra
+    yield from style.handle.on((0, y, at), 2 * half_x, height)
 
 
-def _tray(rng: np.random.Generator, plan: Plan, style: _Style, index: int) -> list[Solid]:
+def _tray(rng: np.random.Generator, plan: Plan, style: _Style, index: int) -> Iterator[Solid]:
     """The open box behind the front, and what lies in it."""
     margin = plan.divider / 2 + 0.004 * plan.scale
     low, high = plan.levels[index] + margin, plan.levels[index + 1] - margin
@@ -158,14 +137,13 @@ def _tray(rng: np.random.Generator, plan: Plan, style: _Style, index: int) -> li
     walls = min(style.walls, 0.1 * height)
     half = np.array([half_x, height / 2, (start - end) / 2])
     center = np.array([0.0, low + height / 2, (start + end) / 2])
-    hole = box(center + (0, walls, 0), half - (walls, 0, walls))
-    solids = [box(center, half, hole=hole)]
+    yield open_box(center, half, walls, walls)
     if style.rails:
         y, thick = low + rng.uniform(0.6, 0.8) * (high - low), 0.006 * plan.scale
         for side in (-1, 1):
-            solids.append(box((side * (half_x - thick), y, center[2]), (thick, thick, half[2])))
+            yield box((side * (half_x - thick), y, center[2]), (thick, thick, half[2]))
         rise = (y - low) / 2
-        solids.append(box((0, low + rise, end + thick), (half_x, rise, thick)))
+        yield box((0, low + rise, end + thick), (half_x, rise, thick))
     if rng.random() < style.full:
         room = 0.95 * (high - low) - walls
         size = np.array([half[0] - walls, room / 2, half[2] - plan.front - walls])
@@ -173,8 +151,7 @@ def _tray(rng: np.random.Generator, plan: Plan, style: _Style, index: int) -> li
         aside = (half - walls - size) * rng.uniform(-0.8, 0.8, size=3)
         place = (aside[0], low + walls + size[1], center[2] + 0.5 * aside[2])
         heap = rng.random() < 0.5 and style.handle.style not in ("ball", "cup")
-        solids.append((ellipsoid if heap else box)(place, size))
-    return solids
+        yield ellipsoid(place, size) if heap else box(place, size)
 
 
 def shape(rng: np.random.Generator) -> ObjectModel:
@@ -185,29 +162,29 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     style = _style(rng, kind, plan)
     open_top = kind == "kitchen" and rng.random() < 0.5
     if kind == "cart":
-        body = cabinet.cart(rng, plan)
+        body = list(cabinet.cart(rng, plan))
     else:
-        body = cabinet.carcass(rng, plan, open_top, style.handle)
+        body = list(cabinet.carcass(rng, plan, open_top, style.handle))
         if kind in ("tall", "kitchen", "bedside") and rng.random() < 0.12:
             body += cabinet.beside(rng, plan)
         elif not open_top and rng.random() < (0.1 if kind == "desktop" else 0.45):
             body += cabinet.top_plate(rng, plan)
     body += stand(rng, support, (plan.width, plan.base, plan.depth))
-    drawers = [_front(plan, style, i) + _tray(rng, plan, style, i) for i in range(3)]
+    drawers = [[*_front(plan, style, i), *_tray(rng, plan, style, i)] for i in range(3)]
     travel = style.tray_depth * (plan.depth - plan.back) * rng.uniform(0.6, 0.98)
     pivots = [(0.0, plan.levels[i : i + 2].mean(), plan.face[1]) for i in range(3)]
     limits = np.array([[0.0, 0.9 * travel]] * 3)
     return ObjectModel([body, *drawers], np.tile([0.0, 0.0, 1.0], (3, 1)), np.array(pivots), limits)
 
 
-def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
+def _urdf_axes(ref: MeshObject) -> urdf.CanonicalAxes:
     """Front where the drawers go, up along their stack."""
-    front = ref.axis[0] * opening_sign(ref, 0)
+    front = ref.axis[0] * urdf.opening_sign(ref, 0)
     up = _stack(ref, front)
     if up is None:
         # z, as in robotics, or y, as in graphics, where z lies along the front.
-        return CanonicalAxes(Z if abs(front[2]) < 0.7 else Y, front, ("up",))
-    return CanonicalAxes(up, front)
+        return urdf.CanonicalAxes(urdf.Z if abs(front[2]) < 0.7 else urdf.Y, front, ("up",))
+    return urdf.CanonicalAxes(up, front)
 
 
 def _stack(ref: MeshObject, front: np.ndarray) -> np.ndarray | None:
@@ -219,7 +196,7 @@ def _stack(ref: MeshObject, front: np.ndarray) -> np.ndarray | None:
     across = np.eye(3) - np.outer(front, front)
     centers = np.array([mesh.bounds().mean(0) for mesh in ref.parts[1:]]) @ across
     variance, directions = np.linalg.eigh(np.cov(centers.T))
-    up = along_positive(level(directions[:, -1]))
+    up = urdf.along_positive(urdf.level(directions[:, -1]))
     height, width = (
         np.mean([np.ptp(mesh.vertices @ direction) for mesh in ref.parts[1:]])
         for direction in (up, np.cross(up, front))
@@ -248,10 +225,10 @@ DRAWER = Category(
         (-0.002, 0.257, 0.031),
     ),
     shape=shape,
-    urdf_rule=UrdfRule(
-        rest=closed_states,
+    urdf_rule=urdf.UrdfRule(
+        rest=urdf.closed_states,
         axes=_urdf_axes,
-        opening=opens_along(Z),
+        opening=urdf.opens_along(urdf.Z),
         order=1,
         partnet_classes=("StorageFurniture", "Table"),
     ),

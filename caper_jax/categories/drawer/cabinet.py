@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,34 +42,23 @@ _LIFT = {
 
 @dataclass(frozen=True)
 class Plan:
-    """Measures of a cabinet in meters; x centered, floor at y = 0, carcass front at z = 0.
+    """Measures of a cabinet in meters; x centered, floor at y = 0, carcass front at z = 0."""
 
-    Attributes:
-      width, height, depth: outer extents of the carcass.
-      base: height of the stand below it.
-      side, roof, floor, back: thickness of its walls.
-      scale: of small parts, 1 for furniture and less for desktop boxes.
-      front: thickness of the drawers' fronts.
-      inset: fronts lie inside the carcass instead of on it.
-      cover: share of the walls that fronts on the carcass hide.
-      divider: thickness of what separates two drawers, 0 for nothing.
-      levels: [4] heights of the bottom of the lowest drawer's opening, the boundaries between
-        drawers, and the top of the highest one's.
-    """
-
-    width: float
+    width: float  # outer extents of the carcass
     height: float
     depth: float
-    base: float
-    side: float
+    base: float  # height of the stand below it
+    side: float  # thickness of its walls
     roof: float
     floor: float
     back: float
-    scale: float
-    front: float
-    inset: bool
-    cover: float
-    divider: float
+    scale: float  # of small parts, 1 for furniture and less for desktop boxes
+    front: float  # thickness of the drawers' fronts
+    inset: bool  # fronts lie inside the carcass instead of on it
+    cover: float  # share of the walls that fronts on the carcass hide
+    divider: float  # thickness of what separates two drawers, 0 for nothing
+    # [4] heights of the bottom of the lowest drawer's opening, the boundaries between drawers, and
+    # the top of the highest one's.
     levels: np.ndarray
 
     @property
@@ -149,7 +139,9 @@ def _shares(rng: np.random.Generator) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(heights) / heights.sum()])
 
 
-def carcass(rng: np.random.Generator, plan: Plan, open_top: bool, handle: Handle) -> list[Solid]:
+def carcass(
+    rng: np.random.Generator, plan: Plan, open_top: bool, handle: Handle
+) -> Iterator[Solid]:
     """Walls, what separates the drawers, and what fills the rest of the front."""
     half = np.array([plan.width, plan.height, plan.depth]) / 2
     center = np.array([0.0, plan.base + half[1], -half[2]])
@@ -160,59 +152,53 @@ def carcass(rng: np.random.Generator, plan: Plan, open_top: bool, handle: Handle
         low[2] -= 0.1
     if open_top:
         high[1] = plan.top + 0.1
-    solids = [box(center, half, hole=box((low + high) / 2, (high - low) / 2))]
+    yield box(center, half, hole=box((low + high) / 2, (high - low) / 2))
     inner = half[0] - plan.side
     if open_top:  # stretchers hold the sides together
         deep = rng.uniform(0.04, 0.12)
         for z in (-deep / 2, -plan.depth + plan.back + deep / 2)[: rng.integers(1, 3)]:
-            solids.append(box((0, plan.top - plan.roof / 2, z), (inner, plan.roof / 2, deep / 2)))
+            yield box((0, plan.top - plan.roof / 2, z), (inner, plan.roof / 2, deep / 2))
     if plan.divider:
         deep = plan.depth - plan.back if rng.random() < 0.45 else min(0.05, 0.2 * plan.depth)
         for y in plan.levels[1:3]:
-            solids.append(box((0, y, -deep / 2), (inner, plan.divider / 2, deep / 2)))
+            yield box((0, y, -deep / 2), (inner, plan.divider / 2, deep / 2))
     deep = (plan.depth - plan.back) / 2
     blind = rng.random() < 0.5
-    for edge, end, thick, sign in (
-        (plan.levels[3], plan.top - plan.roof, plan.roof, 1),
-        (plan.levels[0], plan.base + plan.floor, plan.floor, -1),
-    ):
+    above = (plan.levels[3], plan.top - plan.roof, plan.roof, 1)
+    below = (plan.levels[0], plan.base + plan.floor, plan.floor, -1)
+    for edge, end, thick, sign in (above, below):
         if abs(end - edge) < 1e-6:
             continue
-        solids.append(box((0, edge + sign * thick / 2, -deep), (inner, thick / 2, deep)))
+        yield box((0, edge + sign * thick / 2, -deep), (inner, thick / 2, deep))
         if blind:
             hidden = 0.0 if plan.inset else plan.cover * thick
             y0, y1 = sorted((edge + sign * (hidden + plan.gap), end + sign * hidden))
             back, front = min(plan.face[0], 0.0), plan.face[1]
             half_x = plan.half_front + plan.gap
             middle = (0, (y0 + y1) / 2, (back + front) / 2)
-            solids.append(box(middle, (half_x, (y1 - y0) / 2, (front - back) / 2)))
-            solids += handle.on((0, middle[1], front), 2 * half_x, y1 - y0)
-    return solids
+            yield box(middle, (half_x, (y1 - y0) / 2, (front - back) / 2))
+            yield from handle.on((0, middle[1], front), 2 * half_x, y1 - y0)
 
 
-def cart(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def cart(rng: np.random.Generator, plan: Plan) -> Iterator[Solid]:
     """An open frame: posts, a plate below and above, and a ledge on each side of a drawer."""
-    round_ = rng.random() < 0.5
-    solids: list[Solid] = []
+    make = cylinder if rng.random() < 0.5 else box
     radius = plan.side / 2
     extents = (radius, radius, plan.height / 2)
     y = plan.base + plan.height / 2
     for x in (-plan.width / 2 + radius, plan.width / 2 - radius):
         for z in (-radius, -plan.depth + radius):
-            solids.append((cylinder if round_ else box)((x, y, z), extents, TURN_Y))
+            yield make((x, y, z), extents, TURN_Y)
         for index in range(3):
             low, high = plan.front_levels(index)
             place = (x, low + 0.55 * (high - low), -plan.depth / 2)
-            solids.append(box(place, (0.7 * radius, 0.006, plan.depth / 2 - radius)))
-    for y, thick in (
-        (plan.base + plan.floor / 2, plan.floor),
-        (plan.top - plan.roof / 2, plan.roof),
-    ):
-        solids.append(box((0, y, -plan.depth / 2), (plan.width / 2, thick / 2, plan.depth / 2)))
-    return solids
+            yield box(place, (0.7 * radius, 0.006, plan.depth / 2 - radius))
+    floor, roof = plan.base + plan.floor / 2, plan.top - plan.roof / 2
+    for y, thick in ((floor, plan.floor), (roof, plan.roof)):
+        yield box((0, y, -plan.depth / 2), (plan.width / 2, thick / 2, plan.depth / 2))
 
 
-def top_plate(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def top_plate(rng: np.random.Generator, plan: Plan) -> Iterator[Solid]:
     """A plate that overhangs, perhaps with a rounded front edge or a rim at the back."""
     thick = plan.scale * rng.uniform(0.01, 0.04)
     over = plan.scale * rng.uniform(0.0, 0.03)
@@ -225,18 +211,17 @@ def top_plate(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     if edge < 0.25:  # broken all around
         extents = np.array([half_x, (front - back) / 2, thick / 2])
         taper = 1 - rng.uniform(0.3, 1.0) * thick / extents[:2]
-        solids = [frustum(center, extents, taper, TURN_Y)]
+        yield frustum(center, extents, taper, TURN_Y)
     else:
-        solids = [box(center, (half_x, thick / 2, (front - back) / 2))]
+        yield box(center, (half_x, thick / 2, (front - back) / 2))
     if edge > 0.7:
-        solids.append(cylinder((0, y, front), (thick / 2, thick / 2, half_x), TURN_X))
+        yield cylinder((0, y, front), (thick / 2, thick / 2, half_x), TURN_X)
     if rng.random() < 0.1:
         rise = rng.uniform(0.05, 0.15) * plan.height
-        solids.append(box((0, y + rise / 2, back + 0.01), (half_x, rise / 2, 0.009)))
-    return solids
+        yield box((0, y + rise / 2, back + 0.01), (half_x, rise / 2, 0.009))
 
 
-def beside(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def beside(rng: np.random.Generator, plan: Plan) -> Iterator[Solid]:
     """A compartment without drawers at one side, or the rest of a desk."""
     side = rng.choice((-1.0, 1.0))
     wide = rng.uniform(0.35, 1.1) * plan.width
@@ -245,17 +230,12 @@ def beside(rng: np.random.Generator, plan: Plan) -> list[Solid]:
         half = np.array([wide, plan.top, plan.depth]) / 2
         center = np.array([middle, half[1], -half[2]])
         hole = box(center + (0, 0, plan.back + 0.05), half - (plan.side, plan.side, -0.05))
-        return [box(center, half, hole=hole if rng.random() < 0.6 else None)]
+        yield box(center, half, hole=hole if rng.random() < 0.6 else None)
+        return
     wide = max(wide, 0.55)
     end = side * (plan.width / 2 + wide)
     thick = max(plan.side, 0.012)
-    return [
-        box(
-            (end / 2 - side * plan.width / 4, plan.top + thick / 2, -plan.depth / 2),
-            ((plan.width + wide) / 2, thick / 2, plan.depth / 2 + 0.01),
-        ),
-        box(
-            (end - side * thick, plan.top / 2, -plan.depth / 2),
-            (thick, plan.top / 2, plan.depth / 2),
-        ),
-    ]
+    above = (end / 2 - side * plan.width / 4, plan.top + thick / 2, -plan.depth / 2)
+    yield box(above, ((plan.width + wide) / 2, thick / 2, plan.depth / 2 + 0.01))
+    aside = (end - side * thick, plan.top / 2, -plan.depth / 2)
+    yield box(aside, (thick, plan.top / 2, plan.depth / 2))

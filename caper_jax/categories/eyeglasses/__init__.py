@@ -5,6 +5,7 @@ Temples extend to -z; a positive state folds a temple inwards, by 90 deg at most
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,45 +13,27 @@ import numpy as np
 from caper_jax.articulation.category import Category, Joint, ObjectModel
 from caper_jax.articulation.conversions import ArtImageConversion, CaptraConversion, Front
 from caper_jax.articulation.mesh_object import MeshObject
-from caper_jax.articulation.urdf_rule import (
-    CanonicalAxes,
-    UrdfRule,
-    along_positive,
-    snap_state,
-)
+from caper_jax.articulation.urdf_rule import CanonicalAxes, UrdfRule, along_positive, snap_state
 from caper_jax.categories.eyeglasses import front as fronts
-from caper_jax.categories.forms import about, beam, mirrored
+from caper_jax.categories.forms import UP, about, beam, mirrored
 from caper_jax.geometry.solids import Solid, ellipsoid
 
-_Y = np.array([0.0, 1.0, 0.0])
 _FOLDED = np.radians(90.0)
 
 
 @dataclass(frozen=True)
 class _Line:
-    """What both temples share; lengths in meters, angles in radians.
+    """What both temples share; lengths in meters, angles in radians."""
 
-    Attributes:
-      slope: downwards, of the straight piece.
-      splay: outwards.
-      straight: length of the straight piece, from the hinge to the ear.
-      taper: its section's width and height at the ear, relative to those at the hinge.
-      hook: length of the rest, behind the ear.
-      bend: how far down the rest turns in all.
-      count: pieces of the rest.
-      inwards: how fast it curves towards the head.
-      tip: half width and half height of the end.
-    """
-
-    slope: float
-    splay: float
-    straight: float
-    taper: tuple[float, float]
-    hook: float
-    bend: float
-    count: int
-    inwards: float
-    tip: tuple[float, float]
+    slope: float  # downwards, of the straight piece
+    splay: float  # outwards
+    straight: float  # length of the straight piece, from the hinge to the ear
+    taper: tuple[float, float]  # width and height at the ear, relative to those at the hinge
+    hook: float  # length of the rest, behind the ear
+    bend: float  # how far down the rest turns in all
+    count: int  # pieces of the rest
+    inwards: float  # how fast it curves towards the head
+    tip: tuple[float, float]  # half width and half height of the end
 
 
 def _draw_line(rng: np.random.Generator, scale: float, sturdy: bool) -> _Line:
@@ -74,7 +57,7 @@ def _draw_line(rng: np.random.Generator, scale: float, sturdy: bool) -> _Line:
     )
 
 
-def _temple(rng: np.random.Generator, hinge: np.ndarray, half, line: _Line) -> list[Solid]:
+def _temple(rng: np.random.Generator, hinge: np.ndarray, half, line: _Line) -> Iterator[Solid]:
     """The right temple, from the hinge back to the tip behind the ear.
 
     Args:
@@ -88,7 +71,7 @@ def _temple(rng: np.random.Generator, hinge: np.ndarray, half, line: _Line) -> l
     way = np.array([np.sin(splay), -np.sin(line.slope), -1.0])
     ear = hinge + line.straight * way
     taper = np.maximum(line.taper, (0.0006 / thin, 0.0008 / high)).clip(None, 1.0)
-    pieces = [beam(hinge, ear, half, _Y, taper)]
+    yield beam(hinge, ear, half, UP, taper)
     tip = np.array(line.tip)
     place, angle = ear, line.slope
     for index in range(line.count):
@@ -96,13 +79,13 @@ def _temple(rng: np.random.Generator, hinge: np.ndarray, half, line: _Line) -> l
         step = np.array([-line.inwards * (index + 1), -np.sin(angle), -np.cos(angle)])
         end = place + line.hook / line.count * step
         swell = 0.5 * (tip + taper * half) if index == 0 else tip
-        pieces.append(beam(place - 0.4 * tip[1] * step, end, swell, _Y))
+        yield beam(place - 0.4 * tip[1] * step, end, swell, UP)
         place = end
-    pieces.append(ellipsoid(place, (tip[0], tip[1], 1.2 * tip[1]), about("x", -angle)))
-    return pieces
+    yield ellipsoid(place, (tip[0], tip[1], 1.2 * tip[1]), about("x", -angle))
 
 
-def _both(solids: list[Solid]) -> list[Solid]:
+def _both(solids: Iterable[Solid]) -> list[Solid]:
+    solids = list(solids)
     return solids + [mirrored(solid, "x") for solid in solids]
 
 
@@ -112,9 +95,8 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     Clear lenses are there in half of the instances (depth cameras look through glass), dark ones
     always.
     """
-    style = str(
-        rng.choice(["full", "half", "brow", "rimless", "shield"], p=[0.7, 0.12, 0.06, 0.05, 0.07])
-    )
+    styles = ["full", "half", "brow", "rimless", "shield"]
+    style = str(rng.choice(styles, p=[0.7, 0.12, 0.06, 0.05, 0.07]))
     dark = style == "shield" or rng.random() < 0.35
     metal = style in ("half", "rimless") or rng.random() < 0.4
     front, name = fronts.draw_front(rng, metal, large=dark)
@@ -149,18 +131,14 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     frame += _both(fronts.end_piece(rng, front, hinge, (thin, high)))
 
     line = _draw_line(rng, front.scale, sturdy=not front.metal)
-    left, right = (_temple(rng, hinge, (thin, high), line) for _ in range(2))
-    left = [mirrored(solid, "x") for solid in left]
+    left = [mirrored(solid, "x") for solid in _temple(rng, hinge, (thin, high), line)]
+    right = list(_temple(rng, hinge, (thin, high), line))
     # The hinge's axis may lean with the temple; folding takes -z to +x at -x, to -x at +x.
-    lean = about("x", line.slope if rng.random() < 0.3 else 0.0) @ _Y
+    lean = about("x", line.slope if rng.random() < 0.3 else 0.0) @ UP
     pivot = hinge - (thin, 0.0, 0.0)
     limits = [(0.0, rng.uniform(np.radians(84), _FOLDED))] * 2
-    return ObjectModel(
-        [frame, left, right],
-        np.stack([-lean, lean]),
-        np.stack([pivot * (-1, 1, 1), pivot]),
-        np.array(limits),
-    )
+    axis, pivot = np.stack([-lean, lean]), np.stack([pivot * (-1, 1, 1), pivot])
+    return ObjectModel([frame, left, right], axis, pivot, np.array(limits))
 
 
 def _unfolded(ref: MeshObject) -> np.ndarray:
@@ -184,7 +162,7 @@ def _urdf_axes(ref: MeshObject) -> CanonicalAxes:
 def _temple_axes(ref: MeshObject) -> np.ndarray:
     """A temple folds to the middle: about -y at -x, about +y at +x."""
     sides = np.array([mesh.bounds()[:, 0].mean() for mesh in ref.parts[1:]])
-    return np.sign(sides)[:, None] * _Y
+    return np.sign(sides)[:, None] * UP
 
 
 # In the files the temples reach back from the lenses.

@@ -5,41 +5,29 @@ Pieces are built for the right (+x) half where both halves are alike.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from caper_jax.categories.forms import about, along, beam, chain
+from caper_jax.categories.forms import UP, about, along, beam, chain
 from caper_jax.geometry.solids import Solid, cylinder, ellipsoid
-
-_Y = np.array([0.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True)
 class Front:
-    """What all pieces of a frame's front share, meters; right means +x.
+    """What all pieces of a frame's front share, meters; right means +x."""
 
-    Attributes:
-      scale: of a head, 1 for a grown-up's.
-      width: between the outsides of the two end pieces.
-      gap: between the two rims, at the nose.
-      outline: [n, 2] corners of the right lens about ``center``, counterclockwise from +x.
-      center: x of the right lens.
-      half: (a, b) half extents of the lens before its outline is deformed.
-      rim: (half width in the plane of the lens, half depth) of the rims.
-      curve: the front lies at z = -curve x^2.
-      metal: wire rather than plastic.
-    """
-
-    scale: float
-    width: float
-    gap: float
+    scale: float  # of a head, 1 for a grown-up's
+    width: float  # between the outsides of the two end pieces
+    gap: float  # between the two rims, at the nose
+    # [n, 2] corners of the right lens about ``center``, counterclockwise from +x.
     outline: np.ndarray
-    center: float
-    half: tuple[float, float]
-    rim: tuple[float, float]
-    curve: float
-    metal: bool
+    center: float  # x of the right lens
+    half: tuple[float, float]  # (a, b) half extents of the lens before its outline is deformed
+    rim: tuple[float, float]  # (half width in the plane of the lens, half depth) of the rims
+    curve: float  # the front lies at z = -curve x^2
+    metal: bool  # wire rather than plastic
 
     def place(self, x: float, y: float, forward: float = 0.0) -> np.ndarray:
         """[3] the point of the front above (x, y), or ``forward`` of it."""
@@ -106,33 +94,32 @@ def draw_front(rng: np.random.Generator, metal: bool, large: bool) -> tuple[Fron
     curve = rng.uniform(0.001, 0.009) * (1.4 if large else 1.0) / (width / 2) ** 2
     outline = np.stack([x, y], axis=1)
     center = gap / 2 + 2 * rim[0] + a
-    return (
-        Front(scale, width, gap, outline, center, (a, b), rim, curve, metal),
-        name,
-    )
+    return Front(scale, width, gap, outline, center, (a, b), rim, curve, metal), name
 
 
-def rim(rng: np.random.Generator, front: Front, style: str) -> list[Solid]:
+def rim(rng: np.random.Generator, front: Front, style: str) -> Iterator[Solid]:
     """The right rim, a chain; only its upper part in half-rim frames."""
     width, depth = front.rim
     middle = front.outline * (1 + width / front.half[0])
     points = np.array([front.place(front.center + x, y) for x, y in middle])
     normal = front.normal(front.center)
     if style == "full":
-        return chain(points, (width, depth), normal, closed=True)
+        yield from chain(points, (width, depth), normal, closed=True)
+        return
     upper = middle[:, 1] > -0.2 * front.half[1]
     # The outline starts at +x and goes up, so its upper part is contiguous up to one roll.
     first = int(np.argmax(upper & ~np.roll(upper, 1)))
     arc = np.roll(points, -first, axis=0)[: upper.sum()]
     if style == "half":
-        return chain(arc, (width, depth), normal)
+        yield from chain(arc, (width, depth), normal)
+        return
     thick = (rng.uniform(0.002, 0.0035), rng.uniform(0.0015, 0.0025))  # a browline
+    yield from chain(arc, thick, normal)
     lower = np.roll(points, -first - upper.sum() + 1, axis=0)[: (~upper).sum() + 2]
-    wire = (0.0007, 0.0008)
-    return chain(arc, thick, normal) + chain(lower, wire, normal)
+    yield from chain(lower, (0.0007, 0.0008), normal)
 
 
-def lens(rng: np.random.Generator, front: Front) -> list[Solid]:
+def lens(rng: np.random.Generator, front: Front) -> Iterator[Solid]:
     """The right lens: the largest ellipse within its outline, and three upright strips."""
     corners = front.outline
     before = np.roll(corners, 1, axis=0)
@@ -145,7 +132,7 @@ def lens(rng: np.random.Generator, front: Front) -> list[Solid]:
 
     disc = np.hypot(*((points - middle) / half).T).min() * half + under
     place = front.place(front.center + middle[0], middle[1])
-    solids = [cylinder(place, (*disc, thickness), along(normal, _Y))]
+    yield cylinder(place, (*disc, thickness), along(normal, UP))
 
     stations = middle[0] + half[0] * np.array([-0.94, -0.66, 0.66, 0.94])
     way = corners - before
@@ -161,39 +148,31 @@ def lens(rng: np.random.Generator, front: Front) -> list[Solid]:
         least = min(ends[narrow][1] - height, height - ends[narrow][0]) + under
         start, end = (front.place(front.center + stations[i], height) for i in (wide, narrow))
         taper = (np.clip(least / tall, 0.15, 1.0), 1.0)
-        solids.append(beam(start, end, (tall, thickness), normal, taper))
+        yield beam(start, end, (tall, thickness), normal, taper)
     (low_1, high_1), (low_2, high_2) = ends[1:3]
     start = front.place(front.center + stations[1], (low_1 + high_1) / 2)
     end = front.place(front.center + stations[2], (low_2 + high_2) / 2)
     tall = (high_1 - low_1 + high_2 - low_2) / 4 + under
-    solids.append(beam(start, end, (tall, thickness), normal))
-    return solids
+    yield beam(start, end, (tall, thickness), normal)
 
 
-def bridge(rng: np.random.Generator, front: Front, rims: bool) -> list[Solid]:
+def bridge(rng: np.random.Generator, front: Front, rims: bool) -> Iterator[Solid]:
     """A bar over the nose, straight or arched, and perhaps another between the rims' tops."""
     b = front.half[1]
     height = rng.uniform(0.0, 0.55) * b
     rise = rng.uniform(0.0, 0.25) * b
-    half = (front.rim[0] * 1.1, front.rim[1])
-    if not front.metal:
-        half = (rng.uniform(0.0018, 0.0045), front.rim[1])
+    half = (front.rim[0] * 1.1 if front.metal else rng.uniform(0.0018, 0.0045), front.rim[1])
     inner = front.edge(height, -1.0) + front.rim[0]
-    points = [
-        front.place(-inner, height),
-        front.place(0.0, height + rise, rng.uniform(0.0, 0.003)),
-        front.place(inner, height),
-    ]
-    bars = chain(points, half, front.normal(0.0))
+    arch = front.place(0.0, height + rise, rng.uniform(0.0, 0.003))
+    points = [front.place(-inner, height), arch, front.place(inner, height)]
+    yield from chain(points, half, front.normal(0.0))
     if rims and front.metal and rng.random() < 0.3:
         top = min(height + rise + rng.uniform(0.2, 0.4) * b, front.outline[:, 1].max())
         reach = front.edge(top, -1.0) + front.rim[0]
-        bar = beam(front.place(-reach, top), front.place(reach, top), half, front.normal(0.0))
-        bars.append(bar)
-    return bars
+        yield beam(front.place(-reach, top), front.place(reach, top), half, front.normal(0.0))
 
 
-def nose_pad(rng: np.random.Generator, front: Front, low: float) -> list[Solid]:
+def nose_pad(rng: np.random.Generator, front: Front, low: float) -> Iterator[Solid]:
     """The right nose pad, on a wire arm or moulded to the rim; ``low`` in half heights."""
     height = rng.uniform(low, low + 0.4) * front.half[1]
     edge = front.edge(height, -1.0)
@@ -201,33 +180,30 @@ def nose_pad(rng: np.random.Generator, front: Front, low: float) -> list[Solid]:
     if not front.metal:
         half = front.scale * np.array([0.0022, rng.uniform(0.005, 0.008), 0.0035])
         place = front.place(edge, height, -front.rim[1] - 0.001)
-        return [ellipsoid(place, half, tilt)]
+        yield ellipsoid(place, half, tilt)
+        return
     half = front.scale * np.array([0.0013, rng.uniform(0.005, 0.0075), rng.uniform(0.0025, 0.004)])
     back = rng.uniform(0.004, 0.008)
     place = front.place(max(edge - 0.002, 0.004), height, -back)
-    arm = beam(front.place(edge, height), place, (0.0006, 0.0006), _Y)
-    return [ellipsoid(place, half, tilt), arm]
+    yield ellipsoid(place, half, tilt)
+    yield beam(front.place(edge, height), place, (0.0006, 0.0006), UP)
 
 
-def end_piece(rng: np.random.Generator, front: Front, hinge: np.ndarray, half) -> list[Solid]:
+def end_piece(rng: np.random.Generator, front: Front, hinge: np.ndarray, half) -> Iterator[Solid]:
     """The right end piece, from the rim out and back to the hinge, and the hinge's barrel."""
     height = hinge[1]
     x = front.edge(height, 1.0)
     corner = front.place(hinge[0] - 0.3 * half[0], height)
-    pieces = []
     if x < corner[0] - 1e-4:
-        pieces.append(
-            beam(front.place(x - front.rim[0], height), corner, half[::-1], front.normal(x))
-        )
+        yield beam(front.place(x - front.rim[0], height), corner, half[::-1], front.normal(x))
     behind = np.array([hinge[0], height, hinge[2]])
-    pieces.append(beam(corner, behind, (half[0], half[1]), _Y))
+    yield beam(corner, behind, (half[0], half[1]), UP)
     radius = rng.uniform(0.0009, 0.0018)
     barrel = (radius, radius, min(half[1], rng.uniform(0.0015, 0.004)))
-    pieces.append(cylinder(hinge - (half[0], 0, 0), barrel, along(_Y, np.array([0, 0, 1.0]))))
-    return pieces
+    yield cylinder(hinge - (half[0], 0, 0), barrel, along(UP, np.array([0, 0, 1.0])))
 
 
-def shield(rng: np.random.Generator, front: Front) -> list[Solid]:
+def shield(rng: np.random.Generator, front: Front) -> Iterator[Solid]:
     """One lens over both eyes, of upright plates, with a notch for the nose."""
     half = front.half[1] * rng.uniform(0.75, 1.0)
     thickness = rng.uniform(0.0007, 0.0016)
@@ -238,12 +214,9 @@ def shield(rng: np.random.Generator, front: Front) -> list[Solid]:
     low = -half * (1 - notch - drawn_in)
     high = half * (1 - rng.uniform(0.0, 0.4) * middle**2)
     x = edges * front.width / 2
-    plates = [
-        beam(front.place(x[i], y), front.place(x[i + 1], y), (thickness, tall), _Y)
-        for i, (y, tall) in enumerate(zip((low + high) / 2, (high - low) / 2, strict=True))
-    ]
+    for i, (y, tall) in enumerate(zip((low + high) / 2, (high - low) / 2, strict=True)):
+        yield beam(front.place(x[i], y), front.place(x[i + 1], y), (thickness, tall), UP)
     if rng.random() < 0.6:  # a bar along the brows
         brow = [front.place(x[i], high[i]) for i in range(0, 7, 2)]
         brow += [point * (-1, 1, 1) for point in brow[::-1]]
-        plates += chain(brow, (rng.uniform(0.001, 0.0025), rng.uniform(0.0015, 0.003)), _Y)
-    return plates
+        yield from chain(brow, (rng.uniform(0.001, 0.0025), rng.uniform(0.0015, 0.003)), UP)

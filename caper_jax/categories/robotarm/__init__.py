@@ -12,23 +12,20 @@ wrist hide behind the others.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from caper_jax.articulation.category import Category, Joint, ObjectModel
 from caper_jax.articulation.mesh_object import MeshObject
-from caper_jax.articulation.urdf_rule import (
-    CanonicalAxes,
-    UrdfRule,
-    along_positive,
-)
-from caper_jax.categories.forms import about, along
+from caper_jax.articulation.urdf_rule import CanonicalAxes, UrdfRule, along_positive
+from caper_jax.categories.forms import TURN_X, TURN_Y, about, along, beam
 from caper_jax.categories.robotarm import chains
-from caper_jax.geometry.solids import Solid, box, cone, cylinder, ellipsoid, frustum
+from caper_jax.geometry.solids import Solid, box, cone, cylinder, ellipsoid
 
 _UNIT = dict(zip("xyz", np.eye(3), strict=True))
-_ALONG = {"x": about("y", np.pi / 2), "y": about("x", -np.pi / 2), "z": np.eye(3)}  # z -> axis
+_ALONG = {"x": TURN_X, "y": TURN_Y, "z": np.eye(3)}  # z -> axis
 
 _FAMILIES = (
     chains.offset_cobot,
@@ -44,26 +41,17 @@ _SHARES = (0.22, 0.24, 0.12, 0.08, 0.2, 0.08, 0.06)
 
 @dataclass(frozen=True)
 class _Style:
-    """How the links of one arm look.
+    """How the links of one arm look."""
 
-    Attributes:
-      radius: [7] half thickness of each link, meters.
-      boxy: links 1 to 3 are cast boxes rather than tubes.
-      taper: thickness of the end of a long tube over that of its start.
-      slim: thickness of long tubes over that of joints.
-      joint: "split" joints are two discs side by side, "fork" ones a disc that shows on both sides
-        of a wider one, "ball" ones have a round end.
-      bulge: radius of a joint that crosses the links over their thickness.
-      width: half length of such a joint over its radius.
-    """
-
-    radius: np.ndarray
-    boxy: bool
-    taper: float
-    slim: float
+    radius: np.ndarray  # [7] half thickness of each link, meters
+    boxy: bool  # links 1 to 3 are cast boxes rather than tubes
+    taper: float  # thickness of the end of a long tube over that of its start
+    slim: float  # thickness of long tubes over that of joints
+    # "split" joints are two discs side by side, "fork" ones a disc that shows on both sides of a
+    # wider one, "ball" ones have a round end.
     joint: str
-    bulge: float
-    width: float
+    bulge: float  # radius of a joint that crosses the links over their thickness
+    width: float  # half length of such a joint over its radius
 
 
 def _style(rng: np.random.Generator, radius: float, cast: bool) -> _Style:
@@ -78,7 +66,7 @@ def _style(rng: np.random.Generator, radius: float, cast: bool) -> _Style:
     )
 
 
-def _link(k: int, chain: chains.Chain, style: _Style) -> list[Solid]:
+def _link(k: int, chain: chains.Chain, style: _Style) -> Iterator[Solid]:
     """The solids of link k: tubes along its path, discs about its two joints."""
     path, radius = chain.paths[k], style.radius[k]
     before = chain.axes[k - 1] if k > 0 else None
@@ -103,25 +91,14 @@ def _link(k: int, chain: chains.Chain, style: _Style) -> list[Solid]:
             end[bend] += thick[bend + 1] * forward[bend]
     boxy = style.boxy and k in (1, 2, 3)
     taper = np.where(long & (k in (2, 3, 4)), style.taper, 1.0)
-    solids = [_tube(start[i], end[i], thick[i], taper[i], boxy) for i in range(len(way))]
+    for i in range(len(way)):
+        up = _UNIT["y"] if abs(forward[i, 0]) > 0.9 else _UNIT["x"]
+        narrow = None if taper[i] == 1.0 else taper[i]
+        yield beam(start[i], end[i], (thick[i], thick[i]), up, narrow, round_=not boxy)
     if before is not None and not on_axis[0]:
-        solids.append(_joint(path[0], before, style.radius[k - 1], style, child=True))
+        yield _joint(path[0], before, style.radius[k - 1], style, child=True)
     if after is not None and not on_axis[-1]:
-        solids.append(_joint(path[-1], after, radius, style, child=False))
-    return solids
-
-
-def _tube(start, end, thick: float, taper: float, boxy: bool) -> Solid:
-    way = end - start
-    length = np.sqrt(way @ way)
-    side = _UNIT["y"] if abs(way[0]) > 0.9 * length else _UNIT["x"]
-    rotation = along(way, side)
-    center, half = (start + end) / 2, (thick, thick, length / 2)
-    if taper == 1.0:
-        return (box if boxy else cylinder)(center, half, rotation)
-    if boxy:
-        return frustum(center, half, (taper, taper), rotation)
-    return cone(center, half, taper, rotation)
+        yield _joint(path[-1], after, radius, style, child=False)
 
 
 def _joint(place, axis: str, radius: float, style: _Style, child: bool) -> Solid:
@@ -138,7 +115,7 @@ def _joint(place, axis: str, radius: float, style: _Style, child: bool) -> Solid
     return cylinder(place, (0.82 * radius, 0.82 * radius, width), rotation)
 
 
-def _effector(rng: np.random.Generator, chain: chains.Chain, radius: float) -> list[Solid]:
+def _effector(rng: np.random.Generator, chain: chains.Chain, radius: float) -> Iterator[Solid]:
     """A two-finger gripper, a suction cup or a bare flange at the tip."""
     tip, place = chain.tip, chain.paths[6][-1]
     # The wide side of a hand that hangs in front of the forearm is turned across it.
@@ -151,59 +128,50 @@ def _effector(rng: np.random.Generator, chain: chains.Chain, radius: float) -> l
         return place + rotation @ (x, y, z)
 
     if style < 0.2:
-        return [cylinder(at(0, 0, 0), (0.9 * radius, 0.9 * radius, 0.12 * radius), rotation)]
+        yield cylinder(at(0, 0, 0), (0.9 * radius, 0.9 * radius, 0.12 * radius), rotation)
+        return
     if style < 0.4:
         stem, cup = radius * rng.uniform((0.3, 0.35), (1.0, 0.8))
-        return [
-            cylinder(at(0, 0, stem), (0.3 * radius, 0.3 * radius, stem), rotation),
-            cone(at(0, 0, 2 * stem), (cup, cup, 0.3 * radius), 0.5, rotation @ about("x", np.pi)),
-        ]
+        yield cylinder(at(0, 0, stem), (0.3 * radius, 0.3 * radius, stem), rotation)
+        yield cone(at(0, 0, 2 * stem), (cup, cup, 0.3 * radius), 0.5, rotation @ about("x", np.pi))
+        return
     palm = radius * rng.uniform((0.45, 1.0, 0.4), (0.7, 2.0, 0.9))
     finger = radius * rng.uniform((0.15, 0.12, 0.4), (0.35, 0.25, 0.75))
     gap = rng.uniform(finger[1], palm[1] - finger[1])
-    solids = [box(at(0, 0, palm[2]), palm, rotation)]
+    yield box(at(0, 0, palm[2]), palm, rotation)
     for side in (-1, 1):
-        solids.append(box(at(0, side * gap, 2 * palm[2] + 0.98 * finger[2]), finger, rotation))
-    return solids
+        yield box(at(0, side * gap, 2 * palm[2] + 0.98 * finger[2]), finger, rotation)
 
 
-def _stand(rng: np.random.Generator, chain: chains.Chain, radius: float) -> list[Solid]:
+def _stand(rng: np.random.Generator, chain: chains.Chain, radius: float) -> Iterator[Solid]:
     """Foot and connectors, which tell the front from the back, and what the arm stands on."""
     height = chain.paths[0][-1][1]
     foot = radius * rng.uniform(1.15, 1.6)
     thick = min(radius * rng.uniform(0.15, 0.4), 0.5 * height)
-    solids: list[Solid] = []
     behind = 0.0
     round_ = rng.random() < 0.5
     if round_:
-        solids.append(cylinder((0, thick / 2, 0), (foot, foot, thick / 2), _ALONG["y"]))
+        yield cylinder((0, thick / 2, 0), (foot, foot, thick / 2), TURN_Y)
     else:
         behind = foot * rng.uniform(0.0, 0.6)
-        half = (foot, thick / 2, foot + behind / 2)
-        solids.append(box((0, thick / 2, -behind / 2), half))
+        yield box((0, thick / 2, -behind / 2), (foot, thick / 2, foot + behind / 2))
     if behind < 0.2 * foot or rng.random() < 0.6:
         depth = radius * rng.uniform(0.35, 1.1)
         tall = height * rng.uniform(0.5, 0.95)
         place = (0, tall / 2, -0.8 * radius - depth / 2)
-        solids.append(box(place, (radius * rng.uniform(0.45, 0.95), tall / 2, depth / 2)))
+        yield box(place, (radius * rng.uniform(0.45, 0.95), tall / 2, depth / 2))
     style = rng.random()
     if style < 0.25:  # a pedestal
         half = (foot * rng.uniform(1.0, 1.6), rng.uniform(0.03, 0.3), foot * rng.uniform(1.0, 1.6))
         center = (0, -half[1], -behind / 2)
         if round_:
-            solids.append(box(center, half))
+            yield box(center, half)
         else:
-            solids.append(cylinder(center, (half[0], half[2], half[1]), _ALONG["y"]))
+            yield cylinder(center, (half[0], half[2], half[1]), TURN_Y)
     elif style < 0.45:  # a mounting plate
         half = (rng.uniform(1.2, 3.0) * foot, rng.uniform(0.005, 0.015), rng.uniform(1.2, 3) * foot)
         shift = (half[2] - foot) * rng.uniform(-0.6, 0.6)
-        solids.append(box((0, -half[1], shift), half))
-    return solids
-
-
-def _scaled(chain: chains.Chain, factor: np.ndarray, radius: float) -> chains.Chain:
-    paths = tuple(path * factor for path in chain.paths)
-    return replace(chain, paths=paths, tip=chain.tip * np.sign(factor), radius=radius)
+        yield box((0, -half[1], shift), half)
 
 
 def shape(rng: np.random.Generator) -> ObjectModel:
@@ -212,9 +180,11 @@ def shape(rng: np.random.Generator) -> ObjectModel:
     chain = family(rng)
     size = rng.uniform(0.75, 1.25)
     side = -1.0 if rng.random() < 0.2 else 1.0  # some arms are built the other way round
-    chain = _scaled(chain, size * np.array([side, 1.0, 1.0]), size * chain.radius)
+    paths = tuple(path * (size * np.array([side, 1.0, 1.0])) for path in chain.paths)
+    tip = chain.tip * np.sign([side, 1.0, 1.0])
+    chain = replace(chain, paths=paths, tip=tip, radius=size * chain.radius)
     style = _style(rng, chain.radius, cast=family is chains.industrial)
-    parts = [_link(k, chain, style) for k in range(7)]
+    parts = [list(_link(k, chain, style)) for k in range(7)]
     parts[0] += _stand(rng, chain, style.radius[0])
     parts[6] += _effector(rng, chain, style.radius[6])
     return ObjectModel(

@@ -15,8 +15,8 @@ floor or into itself.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -25,27 +25,23 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Chain:
-    """A serial chain of seven links in its rest pose, standing on the floor (y = 0) at the origin.
+    """A serial chain of seven links in its rest pose, on the floor (y = 0) at the origin."""
 
-    Attributes:
-      paths: of each link [n, 3] points, meters: path k begins on joint k (path 0 on the floor) and
-        ends where joint k + 1 is.
-      axes: of the six joints, the letter of the positive canonical axis each turns about at rest.
-      limits: [6, 2] degrees from the rest pose.
-      tip: [3] unit direction that the flange faces.
-      radius: half the thickness of the lowest link, meters.
-    """
-
+    # Of each link [n, 3] points, meters: path k begins on joint k (path 0 on the floor) and ends
+    # where joint k + 1 is.
     paths: tuple[np.ndarray, ...]
+    # Of the six joints, the letter of the positive canonical axis each turns about at rest.
     axes: str
-    limits: np.ndarray
-    tip: np.ndarray
-    radius: float
+    limits: np.ndarray  # [6, 2] degrees from the rest pose
+    tip: np.ndarray  # [3] unit direction that the flange faces
+    radius: float  # half the thickness of the lowest link, meters
 
 
-def _chain(paths: list[list[Point]], axes: str, limits, tip: Point, radius: float) -> Chain:
-    arrays = tuple(np.array(path) for path in paths)
-    return Chain(arrays, axes, np.array(limits, float), np.array(tip), radius)
+def _chain(links: Sequence[Sequence[Point]], axes: str, limits, tip: Point, radius: float) -> Chain:
+    """Each link goes on where the one before it ended, through the points given."""
+    starts = [(0, 0, 0), *(link[-1] for link in links)]
+    paths = tuple(np.array([start, *link]) for start, link in zip(starts, links, strict=False))
+    return Chain(paths, axes, np.array(limits, float), np.array(tip), radius)
 
 
 def _varied(rng: np.random.Generator, *lengths: float) -> np.ndarray:
@@ -63,17 +59,17 @@ def offset_cobot(rng: np.random.Generator) -> Chain:
     h, a, b, down, out, s, w, radius = _varied(rng, *rows[rng.integers(3)])
     inner = rng.uniform(0.0, 0.25) * s  # the forearm lies that far from the middle plane
     reach = a + b
-    paths: list[list[Point]] = [
-        [(0, 0, 0), (0, 0.5 * h, 0)],
-        [(0, 0.5 * h, 0), (0, h, 0), (0.45 * s, h, 0)],
-        [(0.45 * s, h, 0), (s, h, 0), (s, h, a), (0.5 * (s + inner), h, a)],
-        [(0.5 * (s + inner), h, a), (inner, h, a), (inner, h, reach), (0.5 * w, h, reach)],
-        [(0.5 * w, h, reach), (w, h, reach), (w, h - 0.5 * down, reach)],
-        [(w, h - 0.5 * down, reach), (w, h - down, reach), (w + 0.55 * out, h - down, reach)],
-        [(w + 0.55 * out, h - down, reach), (w + out, h - down, reach)],
+    links = [
+        [(0, 0.5 * h, 0)],
+        [(0, h, 0), (0.45 * s, h, 0)],
+        [(s, h, 0), (s, h, a), (0.5 * (s + inner), h, a)],
+        [(inner, h, a), (inner, h, reach), (0.5 * w, h, reach)],
+        [(w, h, reach), (w, h - 0.5 * down, reach)],
+        [(w, h - down, reach), (w + 0.55 * out, h - down, reach)],
+        [(w + out, h - down, reach)],
     ]
     limits = [(-170, 170), (-140, 5), (-70, 110), (-150, 90), (-120, 120), (-175, 175)]
-    return _chain(paths, "yxxxyx", limits, (1, 0, 0), radius)
+    return _chain(links, "yxxxyx", limits, (1, 0, 0), radius)
 
 
 def panda(rng: np.random.Generator) -> Chain:
@@ -81,30 +77,21 @@ def panda(rng: np.random.Generator) -> Chain:
     h, a, b, elbow, hang, flange = _varied(rng, 0.333, 0.316, 0.384, 0.0825, 0.088, 0.107)
     knee, wrist = h + a, h + a + b
     low = wrist - flange
-    first: list[list[Point]] = [[(0, 0, 0), (0, 0.42 * h, 0)], [(0, 0.42 * h, 0), (0, h, 0)]]
-    hand: list[Point] = [(0, wrist, 0), (0, wrist, hang), (0, low, hang)]
-    if rng.random() < 0.6:  # the flange does not turn
-        half = h + 0.55 * a
-        paths: list[list[Point]] = [
-            *first,
-            [(0, h, 0), (0, half, 0)],
-            [(0, half, 0), (0, knee - 0.3 * a, 0), (0, knee, elbow)],
-            [(0, knee, elbow), (0, knee + 0.3 * b, 0)],
-            [(0, knee + 0.3 * b, 0), (0, wrist, 0)],
-            hand,
-        ]
-        limits = [(-166, 166), (-60, 75), (-130, 130), (-1, 140), (-150, 150), (-200, 1)]
-        return _chain(paths, "yxyxyx", limits, (0, -1, 0), 0.068)
-    paths = [
-        *first,
-        [(0, h, 0), (0, knee - 0.3 * a, 0), (0, knee, elbow)],
-        [(0, knee, elbow), (0, knee + 0.3 * b, 0)],
-        [(0, knee + 0.3 * b, 0), (0, wrist, 0)],
-        [*hand[:2], (0, wrist - 0.55 * flange, hang)],
-        [(0, wrist - 0.55 * flange, hang), hand[2]],
+    first = [[(0, 0.42 * h, 0)], [(0, h, 0)]]
+    elbow_links = [
+        [(0, knee - 0.3 * a, 0), (0, knee, elbow)],
+        [(0, knee + 0.3 * b, 0)],
+        [(0, wrist, 0)],
     ]
+    if rng.random() < 0.6:  # the flange does not turn
+        hand = [(0, wrist, hang), (0, low, hang)]
+        links = [*first, [(0, h + 0.55 * a, 0)], *elbow_links, hand]
+        limits = [(-166, 166), (-60, 75), (-130, 130), (-1, 140), (-150, 150), (-200, 1)]
+        return _chain(links, "yxyxyx", limits, (0, -1, 0), 0.068)
+    hand = [(0, wrist, hang), (0, wrist - 0.55 * flange, hang)]
+    links = [*first, *elbow_links, hand, [(0, low, hang)]]
     limits = [(-166, 166), (-60, 75), (-1, 130), (-150, 150), (-200, 1), (-166, 166)]
-    return _chain(paths, "yxxyxy", limits, (0, -1, 0), 0.068)
+    return _chain(links, "yxxyxy", limits, (0, -1, 0), 0.068)
 
 
 def upright(rng: np.random.Generator) -> Chain:
@@ -115,7 +102,6 @@ def upright(rng: np.random.Generator) -> Chain:
     )
     h, a, b, c, radius = _varied(rng, *rows[rng.integers(2)])
     knee, wrist, top = h + a, h + a + b, h + a + b + c
-    base: list[list[Point]] = [[(0, 0, 0), (0, 0.45 * h, 0)], [(0, 0.45 * h, 0), (0, h, 0)]]
     if rng.random() < 0.5:  # the upper arm does not roll
         stops = [h, knee, knee + 0.5 * b, wrist, wrist + 0.55 * c, top]
         axes = "yxxyxy"
@@ -124,8 +110,8 @@ def upright(rng: np.random.Generator) -> Chain:
         stops = [h, h + 0.5 * a, knee, knee + 0.5 * b, wrist, top]
         axes = "yxyxyx"
         limits = [(-170, 170), (-75, 75), (-170, 170), (-120, 120), (-170, 170), (-115, 115)]
-    column: list[list[Point]] = [[(0, low, 0), (0, high, 0)] for low, high in pairwise(stops)]
-    return _chain([*base, *column], axes, limits, (0, 1, 0), radius)
+    links = [[(0, y, 0)] for y in (0.45 * h, *stops)]
+    return _chain(links, axes, limits, (0, 1, 0), radius)
 
 
 def upright_offset(rng: np.random.Generator) -> Chain:
@@ -134,17 +120,17 @@ def upright_offset(rng: np.random.Generator) -> Chain:
     h, a, b, c, s, radius = _varied(rng, *rows[rng.integers(2)])
     inner = rng.uniform(0.0, 0.3) * s
     knee, wrist = h + a, h + a + b
-    paths: list[list[Point]] = [
-        [(0, 0, 0), (0, 0.4 * h, 0)],
-        [(0, 0.4 * h, 0), (0, h, 0), (0.45 * s, h, 0)],
-        [(0.45 * s, h, 0), (s, h, 0), (s, knee, 0), (0.55 * s, knee, 0)],
-        [(0.55 * s, knee, 0), (inner, knee, 0), (inner, knee + 0.35 * b, 0)],
-        [(inner, knee + 0.35 * b, 0), (inner, wrist, 0)],
-        [(inner, wrist, 0), (inner, wrist + 0.55 * c, 0)],
-        [(inner, wrist + 0.55 * c, 0), (inner, wrist + c, 0)],
+    links = [
+        [(0, 0.4 * h, 0)],
+        [(0, h, 0), (0.45 * s, h, 0)],
+        [(s, h, 0), (s, knee, 0), (0.55 * s, knee, 0)],
+        [(inner, knee, 0), (inner, knee + 0.35 * b, 0)],
+        [(inner, wrist, 0)],
+        [(inner, wrist + 0.55 * c, 0)],
+        [(inner, wrist + c, 0)],
     ]
     limits = [(-170, 170), (-75, 75), (-135, 135), (-170, 170), (-130, 130), (-175, 175)]
-    return _chain(paths, "yxxyxy", limits, (0, 1, 0), radius)
+    return _chain(links, "yxxyxy", limits, (0, 1, 0), radius)
 
 
 def industrial(rng: np.random.Generator) -> Chain:
@@ -158,17 +144,17 @@ def industrial(rng: np.random.Generator) -> Chain:
     h, forth, a, rise, b, c, radius = _varied(rng, *rows[rng.integers(4)])
     top = h + a + rise
     bend, wrist = forth + rng.uniform(0.25, 0.45) * b, forth + b
-    paths: list[list[Point]] = [
-        [(0, 0, 0), (0, 0.45 * h, 0)],
-        [(0, 0.45 * h, 0), (0, h, forth)],
-        [(0, h, forth), (0, h + a, forth)],
-        [(0, h + a, forth), (0, top, bend)],
-        [(0, top, bend), (0, top, wrist)],
-        [(0, top, wrist), (0, top, wrist + 0.6 * c)],
-        [(0, top, wrist + 0.6 * c), (0, top, wrist + c)],
+    links = [
+        [(0, 0.45 * h, 0)],
+        [(0, h, forth)],
+        [(0, h + a, forth)],
+        [(0, top, bend)],
+        [(0, top, wrist)],
+        [(0, top, wrist + 0.6 * c)],
+        [(0, top, wrist + c)],
     ]
     limits = [(-165, 165), (-80, 85), (-100, 60), (-160, 160), (-115, 115), (-175, 175)]
-    return _chain(paths, "yxxzxz", limits, (0, 0, 1), radius)
+    return _chain(links, "yxxzxz", limits, (0, 0, 1), radius)
 
 
 def folded(rng: np.random.Generator) -> Chain:
@@ -176,17 +162,17 @@ def folded(rng: np.random.Generator) -> Chain:
     h, a, lean, forth, b, out, c = _varied(rng, 0.267, 0.284, 0.0535, 0.0775, 0.3425, 0.076, 0.097)
     knee, middle, tip = h + a, lean + forth, lean + forth + out
     wrist = knee - min(b, knee - 2.6 * c)
-    paths: list[list[Point]] = [
-        [(0, 0, 0), (0, 0.5 * h, 0)],
-        [(0, 0.5 * h, 0), (0, h, 0)],
-        [(0, h, 0), (0, knee, lean)],
-        [(0, knee, lean), (0, knee, middle), (0, knee - 0.4 * b, middle)],
-        [(0, knee - 0.4 * b, middle), (0, wrist, middle)],
-        [(0, wrist, middle), (0, wrist, tip), (0, wrist - 0.5 * c, tip)],
-        [(0, wrist - 0.5 * c, tip), (0, wrist - c, tip)],
+    links = [
+        [(0, 0.5 * h, 0)],
+        [(0, h, 0)],
+        [(0, knee, lean)],
+        [(0, knee, middle), (0, knee - 0.4 * b, middle)],
+        [(0, wrist, middle)],
+        [(0, wrist, tip), (0, wrist - 0.5 * c, tip)],
+        [(0, wrist - c, tip)],
     ]
     limits = [(-170, 170), (-100, 60), (-190, 8), (-170, 170), (-110, 90), (-175, 175)]
-    return _chain(paths, "yxxyxy", limits, (0, -1, 0), 0.046)
+    return _chain(links, "yxxyxy", limits, (0, -1, 0), 0.046)
 
 
 def outstretched(rng: np.random.Generator) -> Chain:
@@ -197,14 +183,14 @@ def outstretched(rng: np.random.Generator) -> Chain:
     inner = side - back
     outer = inner + w
     knee, wrist = forth + a, forth + a + b
-    paths: list[list[Point]] = [
-        [(0, 0, 0), (0, 0.6 * h, 0)],
-        [(0, 0.6 * h, 0), (0, h, 0), (0, h, forth), (0.45 * side, h, forth)],
-        [(0.45 * side, h, forth), (side, h, forth), (side, h, knee), (0.5 * side, h, knee)],
-        [(0.5 * side, h, knee), (inner, h, knee), (inner, h, knee + 0.4 * b)],
-        [(inner, h, knee + 0.4 * b), (inner, h, wrist), (inner + 0.5 * w, h, wrist)],
-        [(inner + 0.5 * w, h, wrist), (outer, h, wrist), (outer, h, wrist + 0.5 * c)],
-        [(outer, h, wrist + 0.5 * c), (outer, h, wrist + c)],
+    links = [
+        [(0, 0.6 * h, 0)],
+        [(0, h, 0), (0, h, forth), (0.45 * side, h, forth)],
+        [(side, h, forth), (side, h, knee), (0.5 * side, h, knee)],
+        [(inner, h, knee), (inner, h, knee + 0.4 * b)],
+        [(inner, h, wrist), (inner + 0.5 * w, h, wrist)],
+        [(outer, h, wrist), (outer, h, wrist + 0.5 * c)],
+        [(outer, h, wrist + c)],
     ]
     limits = [(-170, 170), (-130, 8), (-75, 110), (-170, 170), (-120, 120), (-175, 175)]
-    return _chain(paths, "yxxzxz", limits, (0, 0, 1), 0.07)
+    return _chain(links, "yxxzxz", limits, (0, 0, 1), 0.07)
