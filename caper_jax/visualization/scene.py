@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.types import pose_shapes
+from caper_jax.data.types import Frame, pose_shapes
 from caper_jax.errors import CaperError
 from caper_jax.geometry import boxes
 
@@ -65,6 +65,24 @@ class Scene:
     depth: np.ndarray | None = None
     mask: np.ndarray | None = None
     intrinsics: np.ndarray | None = None
+
+    @classmethod
+    def of_frame(
+        cls, frame: Frame, category: Category, points: Any, labels: Any, pose: ArticulatedPose
+    ) -> Scene:
+        """A frame of data with its estimate; what the depth image does not measure is 0 there."""
+        depth = frame.depth
+        return cls(
+            name=frame.name,
+            category=category,
+            points=np.asarray(points),
+            labels=np.asarray(labels),
+            pose=jax.tree.map(np.asarray, pose),
+            truth=frame.truth,
+            depth=None if depth is None else np.nan_to_num(depth, posinf=0.0, neginf=0.0),
+            mask=frame.mask,
+            intrinsics=frame.intrinsics,
+        )
 
     def __post_init__(self) -> None:
         for name, array, shape in self._shapes():

@@ -36,7 +36,7 @@ SHIFT = np.float32(0.002)
 CLOUD = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32) * 0.1 + [0, 0, 1]
 
 
-class Scripted(track_videos.Recorder):
+class Scripted(Tracker):
     """Says of frame i of every video the i-th pose it was given, 2 mm too far away."""
 
     def __init__(self, pose, config):
@@ -47,7 +47,7 @@ class Scripted(track_videos.Recorder):
         self.reset()
 
     def reset(self, points=None, rotation=None, translation=None, labels=None):
-        self.number, self.labels = 0, []
+        self.number = 0
         self.starts += points is not None
 
     def __call__(self, points, labels=None):
@@ -56,10 +56,9 @@ class Scripted(track_videos.Recorder):
         pose = pose.replace(translation=pose.translation + SHIFT * np.array([0, 0, 1], np.float32))
         missing = not self.observe(points).present
         self.given.append(labels)
-        self.labels.append(np.arange(POINTS) % 2)
         self.number += 1
-        number = self.number
-        return TrackResult(pose, None, np.float32(0.01 * number), number == 2, number == 2, missing)
+        second, energy = self.number == 2, np.float32(0.01 * self.number)
+        return TrackResult(pose, np.arange(POINTS) % 2, energy, second, second, missing)
 
 
 @pytest.fixture
@@ -71,7 +70,6 @@ def scripted(monkeypatch):
         made.append(Scripted(random_pose(5), override(TrackerConfig(), *config)))
         return made[-1]
 
-    monkeypatch.setattr(track_videos, "load_recorder", load)
     monkeypatch.setattr("caper_jax.tracker.load_tracker", load)
     return made
 
