@@ -6,9 +6,11 @@ import dataclasses
 import json
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from _helpers.frames import random_frames
+from _helpers.quick import quick_jit
 from _helpers.reproductions import cells, run
 from _helpers.tiny import network, random_variables
 from _helpers.tracks import KnownTracker, disturbed, write_videos
@@ -77,7 +79,7 @@ def test_each_run_has_its_kind_seed_and_budget(tmp_path, monkeypatch):
 
     monkeypatch.setattr(ablations.training, "train", train)
     monkeypatch.setattr(ablations, "load", lambda *_: SimpleNamespace(network=None, card={}))
-    options = Options(out=tmp_path, steps=7, overrides=("training.batch_size=3",))
+    options = Options(out=tmp_path, steps=7, settings=("training.batch_size=3",))
     change = ("network.increment=euclidean",)
     with pytest.raises(CaperError, match="box_euclidean_7steps_seed2 holds a finished run"):
         ablations.train("box", "euclidean", change, 2, options)
@@ -202,9 +204,11 @@ def test_stage_one_sees_the_root_alone_where_there_is_enough_of_it():
         root_pose.root_predictor(estimator)(frames, np.stack([points[:64]] * 2))
 
 
-def test_stage_one_alone_is_the_uncorrected_root():
+def test_stage_one_alone_is_the_uncorrected_root(monkeypatch):
     config = network("fast", pool_first=True)
-    whole = Estimator(LAPTOP, config, random_variables(LAPTOP, config))
+    variables = random_variables(LAPTOP, config)
+    monkeypatch.setattr(jax, "jit", quick_jit)
+    whole = Estimator(LAPTOP, config, variables)
     alone = root_pose.stage_one(whole)
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (2, 64, 3)) + [0, 0, 0.7]
     one, other = whole(points.astype(np.float32)), alone(points.astype(np.float32))
