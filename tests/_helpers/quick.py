@@ -13,10 +13,10 @@ quick_jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level":
 
 
 def traced_jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Stands for ``jax.jit`` where shapes alone matter: traces, and answers with ones."""
+    """Stands for ``jax.jit`` where shapes alone matter: traces, and answers with random numbers."""
+    rng = np.random.default_rng(0)
 
-    def call(*arguments: Any) -> Any:
-        shapes = jax.eval_shape(function, *arguments)
-        return jax.tree.map(lambda leaf: np.ones(leaf.shape, leaf.dtype), shapes)
+    def draw(leaf: jax.ShapeDtypeStruct) -> np.ndarray:
+        return rng.uniform(0.5, 1.0, leaf.shape).astype(leaf.dtype)
 
-    return call
+    return lambda *arguments: jax.tree.map(draw, jax.eval_shape(function, *arguments))

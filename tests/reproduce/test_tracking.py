@@ -1,4 +1,4 @@
-"""Tables of tracking, with trackers whose errors are known; the tracker itself once, for jitter."""
+"""Tables of tracking, with trackers whose errors are known."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 from _helpers.frames import random_pose
-from _helpers.quick import quick_jit
+from _helpers.quick import traced_jit
 from _helpers.reproductions import cells, run
 from _helpers.tiny import network, random_variables
 from _helpers.tracks import BOX, KnownTracker, disturbed, track, write_videos
@@ -199,7 +199,7 @@ def test_jitter_is_the_change_from_frame_to_frame():
 
 
 def test_jitter_from_videos_to_report(tmp_path, capsys, monkeypatch):
-    """The one compiled tracker; its weights are random, so only the plumbing is looked at."""
+    """A tracker that is traced, not compiled: only the plumbing is looked at."""
     config = network()
     card = {"category": "laptop", "run": {"network": to_dict(config)}}
     write_model(tmp_path / "models" / "laptop", random_variables(LAPTOP, config), card)
@@ -213,7 +213,7 @@ def test_jitter_from_videos_to_report(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(data, "generated_videos", draw)
     config = TrackerConfig(registration=RegistrationConfig(gaussians=32))
     monkeypatch.setattr(tracking, "config_for", lambda _: config)
-    monkeypatch.setattr(jax, "jit", quick_jit)
+    monkeypatch.setattr(jax, "jit", traced_jit)
     options = ["--weights", str(tmp_path / "models"), "--network-alone"]
     options += ["--seed", "5", "--videos", "7", "--noise", "none"]
     assert run("jitter", tmp_path, *options) == 0
