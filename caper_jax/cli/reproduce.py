@@ -34,6 +34,7 @@ _TRACKING = (
     *("category", "videos", "frames", "mode", "data", "format", "split", "weights", "seed"),
     *("noise", "network_alone", "object_scale"),
 )
+_TRACKED = (*_TRACKING, "given_masks")
 _STATIC = (
     *("category", "frames", "data", "format", "split", "weights", "seed", "noise"),
     "object_scale",
@@ -75,25 +76,16 @@ REPRODUCTIONS = {
         "root_pose", "rotation decoupled or regressed directly; trains both", _TRAINED
     ),
     "table8": Reproduction("static", "pose estimation by how much is hidden", _STATIC),
-    "table4": Reproduction(
-        "tracking", "pose tracking, ReArt-Videos categories", (*_TRACKING, "given_masks")
-    ),
-    "table5": Reproduction(
-        "tracking", "pose tracking, seven parts of an arm", (*_TRACKING, "given_masks")
-    ),
-    "table6": Reproduction(
-        "tracking", "pose tracking, PM-Videos categories", (*_TRACKING, "given_masks")
-    ),
+    "table4": Reproduction("tracking", "pose tracking, ReArt-Videos categories", _TRACKED),
+    "table5": Reproduction("tracking", "pose tracking, seven parts of an arm", _TRACKED),
+    "table6": Reproduction("tracking", "pose tracking, PM-Videos categories", _TRACKED),
     "table9": Reproduction(
         "ablations",
         "Lie against Euclidean increments; trains both",
-        (
-            *("category", "videos", "frames", "mode", "data", "format", "split", "seed", "noise"),
-            *("seeds", "minutes", "steps", "initial", "settings"),
-        ),
+        (*_TRAINED, "videos", "mode"),
     ),
     "table10": Reproduction(
-        "keyframes", "keyframes none, fixed or dynamic; error against frame", _TRACKING
+        "tracking", "keyframes none, fixed or dynamic; error against frame", _TRACKING
     ),
     "reliability": Reproduction("static", "how often the truth lies where the model says", _STATIC),
     "jitter": Reproduction("motion", "jitter on an object that stands still", _MOVING),
