@@ -100,8 +100,7 @@ def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
     from caper_jax.data.images import read_depth, read_intrinsics, read_mask
     from caper_jax.estimator import load
     from caper_jax.progress import progress
-    from caper_jax.visualization.scene import Scene
-    from caper_jax.visualization.table import format_scene
+    from caper_jax.visualization.scene import Scene, format_scene
 
     scenes: list[Scene] = []
     first = 0.0

@@ -82,8 +82,7 @@ def run(options: Estimate) -> int:
     from caper_jax.estimator import load
     from caper_jax.evaluation.records import estimate_record
     from caper_jax.files import write_atomically
-    from caper_jax.visualization.scene import Scene
-    from caper_jax.visualization.table import format_scene
+    from caper_jax.visualization.scene import Scene, format_scene
 
     category = categories.get(options.category)
     cloud, frame = _observe(options)

@@ -28,8 +28,7 @@ from caper_jax.visualization import scene as scenes
 from caper_jax.visualization.page import write_page
 from caper_jax.visualization.picture import write_picture
 from caper_jax.visualization.plots import save_figure
-from caper_jax.visualization.scene import Scene
-from caper_jax.visualization.table import format_scene
+from caper_jax.visualization.scene import Scene, format_scene
 
 # A deep tree with both joint types: the third joint sits on the second link.
 INTRINSICS = np.array([[300.0, 0.0, 100.0], [0.0, 310.0, 80.0], [0.0, 0.0, 1.0]])
