@@ -23,7 +23,6 @@ from caper_jax.tracker import Tracker
 from caper_jax.tracking.step import TrackResult
 
 Start = Literal["truth", "estimator"]
-STARTS: tuple[Start, ...] = ("truth", "estimator")
 _NAME_WIDTH = 30  # of a video in a table
 
 
