@@ -76,9 +76,14 @@ def options_of(command: str, subcommand: str = "") -> frozenset[str]:
         return frozenset()
     words = [subcommand] if subcommand else []
     help_text = printed(command, *words, "--help")
-    if "--help-settings" in help_text:
-        help_text += printed(command, *words, "--help-settings")
-    return frozenset(OPTION.findall(help_text))
+    settings = settings_of(command) if "--help-settings" in help_text else frozenset()
+    return settings.union(OPTION.findall(help_text))
+
+
+@functools.cache
+def settings_of(command: str) -> frozenset[str]:
+    """The settings that ``--help-settings`` of a command names; those of subcommands are alike."""
+    return frozenset(OPTION.findall(printed(command, "--help-settings")))
 
 
 def printed(command: str, *arguments: str) -> str:
