@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 import pytest
-from _helpers.quick import quick_jit
+from _helpers.quick import quick_jit, traced_jit
 from _helpers.tiny import network, random_variables
 
 import caper_jax
@@ -76,9 +76,14 @@ def options_of(command: str, subcommand: str = "") -> frozenset[str]:
         return frozenset()
     words = [subcommand] if subcommand else []
     help_text = printed(command, *words, "--help")
-    if "--help-settings" in help_text:
-        help_text += printed(command, *words, "--help-settings")
-    return frozenset(OPTION.findall(help_text))
+    settings = settings_of(command) if "--help-settings" in help_text else frozenset()
+    return settings.union(OPTION.findall(help_text))
+
+
+@functools.cache
+def settings_of(command: str) -> frozenset[str]:
+    """The settings that ``--help-settings`` of a command names; those of subcommands are alike."""
+    return frozenset(OPTION.findall(printed(command, "--help-settings")))
 
 
 def printed(command: str, *arguments: str) -> str:
@@ -110,7 +115,8 @@ def small_model() -> tuple[caper_jax.Category, NetworkConfig, Any]:
 
 @named("page", [page for page in PAGES if blocks(page, "python")])
 def test_python_blocks_run_in_order(page, small_model, tmp_path, monkeypatch):
-    monkeypatch.setattr(jax, "jit", quick_jit)
+    # Frames that are written must be such; of estimates nothing but the shape is looked at.
+    monkeypatch.setattr(jax, "jit", quick_jit if page.name == "datasets.md" else traced_jit)
     estimator = caper_jax.Estimator(*small_model)
     monkeypatch.setattr(caper_jax, "load", lambda *_, **__: estimator)
     tracker = caper_jax.Tracker(estimator, FEW_STEPS)

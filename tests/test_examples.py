@@ -8,7 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
 import pytest
 
 import caper_jax
@@ -22,16 +21,7 @@ ALLOWED = {"caper_jax", "flax", "jax", "matplotlib", "numpy", "optax", "pyrealse
 def run(name: str, *arguments: str | Path) -> str:
     """What an example prints, run in a process of its own with warnings as errors."""
     (script,) = (path for path in SCRIPTS if path.name.startswith(name))
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(ROOT),
-        "MPLBACKEND": "Agg",
-        # They run once: compiling without optimization takes less time than it costs.
-        "XLA_FLAGS": "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true",
-        # What other examples and tests of this process have compiled.
-        "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
-    }
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
     command = [sys.executable, "-W", "error", script, *arguments]
     process = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert process.returncode == 0, process.stderr

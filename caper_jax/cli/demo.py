@@ -71,13 +71,6 @@ def run(options: Demo) -> int:
     return 0
 
 
-def load_estimator(category: str) -> Callable[[np.ndarray], Prediction]:
-    """The estimator with the weights that ship with the package."""
-    from caper_jax import estimator
-
-    return estimator.load(category)
-
-
 def demo_folder() -> Path:
     """Where the frames lie: ``<category>_<number>/`` with depth, mask, intrinsics and truth."""
     return Path(str(resources.files("caper_jax"))) / "assets" / "demo"
@@ -105,16 +98,16 @@ def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
     """Estimates the frames one by one, as a live camera would, and prints what it finds."""
     from caper_jax.data.clouds import cloud_from_depth
     from caper_jax.data.images import read_depth, read_intrinsics, read_mask
+    from caper_jax.estimator import load
     from caper_jax.progress import progress
-    from caper_jax.visualization.scene import Scene
-    from caper_jax.visualization.table import format_scene
+    from caper_jax.visualization.scene import Scene, format_scene
 
     scenes: list[Scene] = []
     first = 0.0
     seconds: list[float] = []
     calls = 1 + TIMED_CALLS * len(folders)
     with progress(f"{category.name}: loading, compiling, estimating", total=calls) as bar:
-        estimator = load_estimator(category.name)
+        estimator = load(category.name)
         for folder in folders:
             depth, mask = read_depth(folder / "depth.png"), read_mask(folder / "mask.png")
             intrinsics = read_intrinsics(folder / "intrinsics.json", depth.shape)
@@ -128,10 +121,8 @@ def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
                 bar.update(1)
             truth = _read_truth(folder / "truth.json", category)
             name = folder.name.replace("_", " ")
-            cloud, labels, pose = prediction.points, prediction.labels, prediction.pose
-            scenes.append(
-                Scene(name, category, cloud, labels, pose, truth, depth, mask, intrinsics)
-            )
+            shown = prediction.points, prediction.labels, prediction.pose, truth
+            scenes.append(Scene(name, category, *shown, depth, mask, intrinsics))
     for scene in scenes:
         print(f"\n{scene.name}\n{format_scene(scene)}")
     print(

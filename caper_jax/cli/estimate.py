@@ -14,12 +14,10 @@ from caper_jax.cli.common import Positive
 from caper_jax.errors import CaperError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from caper_jax.articulation.category import Category
     from caper_jax.data.clouds import Cloud
+    from caper_jax.data.types import Frame
     from caper_jax.estimator import Prediction
-    from caper_jax.visualization.scene import Scene
 
 NUM_POINTS = 1024
 EXAMPLES = (
@@ -67,22 +65,6 @@ class Estimate:
     object_scale: Positive = 1.0
     camera_roll: float = 0.0
 
-    @property
-    def source(self) -> Path:
-        path = self.depth or self.points
-        assert path is not None  # one of them is given
-        return path
-
-
-@dataclass(frozen=True)
-class _Observation:
-    """The cloud to estimate from and, where it came from an image, the image."""
-
-    cloud: Cloud
-    depth: np.ndarray | None = None
-    mask: np.ndarray | None = None
-    intrinsics: np.ndarray | None = None
-
 
 def parse(argv: Sequence[str]) -> Estimate:
     options = common.parse(Estimate, argv, EXAMPLES)
@@ -100,16 +82,16 @@ def run(options: Estimate) -> int:
     from caper_jax.estimator import load
     from caper_jax.evaluation.records import estimate_record
     from caper_jax.files import write_atomically
-    from caper_jax.visualization.table import format_scene
+    from caper_jax.visualization.scene import Scene, format_scene
 
     category = categories.get(options.category)
-    observation = _observe(options)
-    cloud = observation.cloud
+    cloud, frame = _observe(options)
     estimator = load(category.name, options.weights, options.object_scale, options.camera_roll)
     prediction = estimator(cloud.points[None])
     prediction = jax.tree.map(lambda array: np.asarray(array)[0], prediction)
-    record = estimate_record(options.source.name, prediction, category, cloud)
-    scene = _scene(options.source.name, category, observation, prediction)
+    record = estimate_record(frame.name, prediction, category, cloud)
+    shown = prediction.points, prediction.labels, prediction.pose
+    scene = Scene.of_frame(frame, category, *shown)
 
     print(format_scene(scene))
     print(f"{cloud.available} points, {cloud.dropped} dropped")
@@ -169,15 +151,18 @@ def _check_outputs(options: Estimate) -> None:
         taken[path.resolve()] = path
 
 
-def _observe(options: Estimate) -> _Observation:
+def _observe(options: Estimate) -> tuple[Cloud, Frame]:
+    """The cloud to estimate from, and what there is to draw."""
     from caper_jax.data.clouds import cloud_from_depth, mask_from_box, read_points, sample_points
     from caper_jax.data.images import read_depth, read_intrinsics, read_mask
+    from caper_jax.data.types import Frame
 
     if options.points is not None:
         points = read_points(options.points)
-        return _Observation(sample_points(points, NUM_POINTS, where=str(options.points)))
-    assert options.intrinsics is not None
-    depth = read_depth(options.source, options.depth_scale)
+        cloud = sample_points(points, NUM_POINTS, where=str(options.points))
+        return cloud, Frame(options.points.name, cloud.points)
+    assert options.depth is not None and options.intrinsics is not None
+    depth = read_depth(options.depth, options.depth_scale)
     intrinsics = read_intrinsics(options.intrinsics, (depth.shape[0], depth.shape[1]))
     if options.mask is not None:
         mask = read_mask(options.mask)
@@ -185,7 +170,8 @@ def _observe(options: Estimate) -> _Observation:
         assert options.box is not None
         mask = mask_from_box(depth, intrinsics, common.pixel_box(options.box))
     cloud = cloud_from_depth(depth, mask, intrinsics, NUM_POINTS)
-    return _Observation(cloud, depth, mask, intrinsics)
+    name, points = options.depth.name, cloud.points
+    return cloud, Frame(name, points, depth=depth, mask=mask, intrinsics=intrinsics)
 
 
 def _certainty(prediction: Prediction, category: Category) -> str:
@@ -210,24 +196,3 @@ def _certainty(prediction: Prediction, category: Category) -> str:
         if count < HIDDEN_POINTS:
             lines.append(f"{name}: hidden ({count} points), known through its joint alone")
     return "".join(f"{line}\n" for line in lines)
-
-
-def _scene(
-    name: str, category: Category, observation: _Observation, prediction: Prediction
-) -> Scene:
-    """The estimate with what it was made from, to print and to draw."""
-    import numpy as np
-
-    from caper_jax.visualization.scene import Scene
-
-    depth = observation.depth
-    return Scene(
-        name=name,
-        category=category,
-        points=prediction.points,
-        labels=prediction.labels,
-        pose=prediction.pose,
-        depth=None if depth is None else np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0),
-        mask=observation.mask,
-        intrinsics=observation.intrinsics,
-    )

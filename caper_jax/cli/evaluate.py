@@ -128,7 +128,6 @@ def _write_worst(
     Raises:
       CaperError: every frame failed, or the file cannot be written.
     """
-    import jax
     import numpy as np
 
     from caper_jax.evaluation.protocol import NUM_POINTS, cloud_of
@@ -139,11 +138,8 @@ def _write_worst(
     estimates, truth = evaluation.estimate.rotation, evaluation.truth.rotation
     off = np.degrees(so3.geodesic_distance(estimates, truth)).max(-1)
     off = np.where(evaluation.failed, -1.0, off)
-    order = [
-        int(index)
-        for index in np.argsort(-off, kind="stable")[:count]
-        if not evaluation.failed[index]
-    ]
+    worst = np.argsort(-off, kind="stable")[:count].tolist()
+    order = [index for index in worst if not evaluation.failed[index]]
     if not order:
         raise CaperError("no frame to draw: the estimate of every one failed")
     scenes = []
@@ -152,17 +148,6 @@ def _write_worst(
         frame = dataset[index]
         print(f"  {off[index]:6.1f} deg  {frame.name}")
         prediction = estimator(cloud_of(frame, NUM_POINTS))
-        scenes.append(
-            Scene(
-                name=frame.name,
-                category=dataset.category,
-                points=np.asarray(prediction.points),
-                labels=np.asarray(prediction.labels),
-                pose=jax.tree.map(np.asarray, prediction.pose),
-                truth=frame.truth,
-                depth=frame.depth,
-                mask=frame.mask,
-                intrinsics=frame.intrinsics,
-            )
-        )
+        shown = prediction.points, prediction.labels, prediction.pose
+        scenes.append(Scene.of_frame(frame, dataset.category, *shown))
     write_picture(path, scenes)

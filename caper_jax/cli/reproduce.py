@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-import tyro
+from typing import TYPE_CHECKING
 
 from caper_jax.cli import common
-from caper_jax.cli.common import Count, Positive, Settings, Size
+from caper_jax.cli.common import Settings
 from caper_jax.cli.train import SECTIONS as TRAINING_SECTIONS
 from caper_jax.cli.train import default_sections
 from caper_jax.errors import CaperError, unknown_name
+from caper_jax.reproduce.options import Options
 
 if TYPE_CHECKING:
-    from caper_jax.reproduce.options import Options
     from caper_jax.reproduce.report import Report
 
 EXAMPLES = (
@@ -32,13 +28,13 @@ EXAMPLES = (
     ("table7 --category laptop --steps 4000 --seeds 1", "trains two models"),
     ("jitter --category box --videos 4", "a quick look"),
 )
-# ``Options`` names the settings of trainings, which the command line gives by section.
 SECTIONS = {name: text for name, text in TRAINING_SECTIONS.items() if name != "loader"}
 
 _TRACKING = (
     *("category", "videos", "frames", "mode", "data", "format", "split", "weights", "seed"),
     *("noise", "network_alone", "object_scale"),
 )
+_TRACKED = (*_TRACKING, "given_masks")
 _STATIC = (
     *("category", "frames", "data", "format", "split", "weights", "seed", "noise"),
     "object_scale",
@@ -58,7 +54,7 @@ class Reproduction:
       module: of ``caper_jax.reproduce``, with ``run(name, options) -> Report``; imported
         only when it runs.
       summary: one line for --help.
-      options: fields of ``Reproduce`` that it takes, besides out.
+      options: fields of ``Options`` that it takes, besides out.
     """
 
     module: str
@@ -80,25 +76,16 @@ REPRODUCTIONS = {
         "root_pose", "rotation decoupled or regressed directly; trains both", _TRAINED
     ),
     "table8": Reproduction("static", "pose estimation by how much is hidden", _STATIC),
-    "table4": Reproduction(
-        "tracking", "pose tracking, ReArt-Videos categories", (*_TRACKING, "given_masks")
-    ),
-    "table5": Reproduction(
-        "tracking", "pose tracking, seven parts of an arm", (*_TRACKING, "given_masks")
-    ),
-    "table6": Reproduction(
-        "tracking", "pose tracking, PM-Videos categories", (*_TRACKING, "given_masks")
-    ),
+    "table4": Reproduction("tracking", "pose tracking, ReArt-Videos categories", _TRACKED),
+    "table5": Reproduction("tracking", "pose tracking, seven parts of an arm", _TRACKED),
+    "table6": Reproduction("tracking", "pose tracking, PM-Videos categories", _TRACKED),
     "table9": Reproduction(
         "ablations",
         "Lie against Euclidean increments; trains both",
-        (
-            *("category", "videos", "frames", "mode", "data", "format", "split", "seed", "noise"),
-            *("seeds", "minutes", "steps", "initial", "settings"),
-        ),
+        (*_TRAINED, "videos", "mode"),
     ),
     "table10": Reproduction(
-        "keyframes", "keyframes none, fixed or dynamic; error against frame", _TRACKING
+        "tracking", "keyframes none, fixed or dynamic; error against frame", _TRACKING
     ),
     "reliability": Reproduction("static", "how often the truth lies where the model says", _STATIC),
     "jitter": Reproduction("motion", "jitter on an object that stands still", _MOVING),
@@ -106,58 +93,7 @@ REPRODUCTIONS = {
 }
 
 
-@dataclass(frozen=True)
-class Reproduce:
-    """Measures what a table of the paper shows.
-
-    Prints the paper's figures, ours, and what ours were measured on. Writes the same as markdown
-    and JSON, and pictures of curves.
-
-    Attributes:
-      category: a name, several with commas, or all (default: all of the table)
-      videos: per category (default: the paper's)
-      frames: of each video, or of a test set of single frames (default: the paper's, or 1,000)
-      mode: how generated videos move (default: paper)
-      data: measure on a data set instead
-      format: layout of --data, as for caper evaluate
-      split: of --data (default: test)
-      weights: model directory, or folder with one per category (default: the shipped ones)
-      object_scale: the objects are so many times as large as those the model was trained on, e.g.
-        3.7 for the laptops of PM-Videos and ArtImage (PartNet units read as meters)
-      seed: of generated frames and videos
-      noise: of generated depth (default: kinect)
-      given_masks: add rows with the data's part labels
-      network_alone: track without registration, as the paper does
-      seeds: runs to train of each kind
-      minutes: of training per run (default: 60)
-      steps: of training per run, instead of --minutes
-      initial: model that each run starts from, as for caper train (default: none)
-      out: folder of results, generated videos and runs
-      settings: of the runs, "section.key=value"
-    """
-
-    category: tuple[str, ...] = ()
-    videos: Count | None = None
-    frames: Count | None = None
-    mode: Literal["paper", "cam", "hard"] | None = None
-    data: Path | None = None
-    format: str | None = None
-    split: str | None = None
-    weights: Path | None = None
-    object_scale: Positive = 1.0
-    seed: Size = 0
-    noise: Literal["none", "gauss3mm", "kinect", "realsense"] | None = None
-    given_masks: bool = False
-    network_alone: bool = False
-    seeds: Count = 3
-    minutes: Positive | None = None
-    steps: Count | None = None
-    initial: Annotated[Path | None, tyro.conf.arg(name="from")] = None
-    out: Path = Path("outputs") / "reproduce"
-    settings: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
-
-
-def parse(argv: Sequence[str]) -> tuple[str, Reproduce]:
+def parse(argv: Sequence[str]) -> tuple[str, Options]:
     """What to reproduce, and how.
 
     Raises:
@@ -169,12 +105,12 @@ def parse(argv: Sequence[str]) -> tuple[str, Reproduce]:
     rest = list(argv if name is None else argv[1:])
     settings = Settings(SECTIONS, default_sections)
     made, given = common.parse_with_settings(
-        Reproduce, rest, EXAMPLES, settings, prog="caper reproduce", notes=_what(name)
+        Options, rest, EXAMPLES, settings, prog="caper reproduce", notes=_what(name)
     )
     if name is None:
         raise CaperError(f"say what to reproduce: {', '.join(REPRODUCTIONS)}")
-    options = dataclasses.replace(made, settings=tuple(given))
-    for each in fields(Reproduce):
+    options = replace(made, settings=tuple(given))
+    for each in fields(Options):
         takes = each.name in (*REPRODUCTIONS[name].options, "out")
         if not takes and getattr(options, each.name) != each.default:
             taken = ", ".join(map(_flag, REPRODUCTIONS[name].options))
@@ -184,7 +120,7 @@ def parse(argv: Sequence[str]) -> tuple[str, Reproduce]:
 
 
 def _flag(option: str) -> str:
-    return "--section.key" if option == "settings" else common.flag(Reproduce, option)
+    return "--section.key" if option == "settings" else common.flag(Options, option)
 
 
 def _what(name: str | None) -> str:
@@ -197,23 +133,24 @@ def _what(name: str | None) -> str:
     return "\nwhat to reproduce (caper reproduce WHAT [OPTIONS]):\n" + "".join(lines)
 
 
-def run(parsed: tuple[str, Reproduce]) -> int:
+def run(parsed: tuple[str, Options]) -> int:
     """Runs the command; returns its exit code."""
-    from caper_jax.reproduce.options import Options
     from caper_jax.reproduce.report import markdown, write_report
+    from caper_jax.visualization.plots import write_plot
 
     name, given = parsed
-    values: dict[str, Any] = dict(vars(given))
-    values["overrides"] = values.pop("settings")
-    # None: all of the table, which knows them.
-    values["category"] = tuple(common.chosen_categories(given.category, ()))
-    if given.initial is not None:
-        values["initial"] = common.model_folder(given.initial)
-    options = Options(**values)
+    options = replace(
+        given,
+        # None: all of the table, which knows them.
+        category=tuple(common.chosen_categories(given.category, ())),
+        initial=given.initial and common.model_folder(given.initial),
+    )
     module = importlib.import_module(f"caper_jax.reproduce.{REPRODUCTIONS[name].module}")
     report = _with_machine(module.run(name, options))
     options.out.mkdir(parents=True, exist_ok=True)
-    written = [*write_report(options.out, name, report), *_write_curves(options, name, report)]
+    written = write_report(options.out, name, report)
+    for end, plot in report.curves.items():
+        written.append(write_plot(options.out / f"{name}_{end}.png", plot))
     print(markdown(report))
     print(f"written: {', '.join(map(str, written))}")
     return 0
@@ -227,11 +164,3 @@ def _with_machine(report: Report) -> Report:
     fact = "machine: " + ", ".join(f"{name} {value}" for name, value in machine.items())
     result = {**report.result, "machine": machine}
     return replace(report, facts=[*report.facts, fact], result=result)
-
-
-def _write_curves(options: Options, name: str, report: Report) -> list[Path]:
-    """Writes the report's plots; returns their paths."""
-    from caper_jax.visualization.plots import write_plot
-
-    paths = {options.out / f"{name}_{end}.png": plot for end, plot in report.curves.items()}
-    return [write_plot(path, plot) for path, plot in paths.items()]

@@ -167,7 +167,8 @@ def run(options: Track) -> int:
 
 
 def _track_recorded(options: Track, model: dict[str, Any]) -> None:
-    from caper_jax.cli.track_videos import choose, load_recorder, open_videos, track_all
+    from caper_jax.cli.track_videos import choose, open_videos, track_all
+    from caper_jax.tracker import load_tracker
 
     assert options.data is not None and options.out is not None
     dataset, videos = open_videos(
@@ -180,7 +181,7 @@ def _track_recorded(options: Track, model: dict[str, Any]) -> None:
     )
     videos = choose(videos, options.video, options.videos)
     track_all(
-        load_recorder(**model),
+        load_tracker(**model),
         dataset,
         videos,
         options.out,

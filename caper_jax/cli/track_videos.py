@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from caper_jax.config import to_dict
 from caper_jax.data.readers import formats, open_dataset
@@ -17,7 +16,6 @@ from caper_jax.data.readers.depth_folder import FORMAT as FOLDER
 from caper_jax.data.readers.depth_folder import is_depth_folder
 from caper_jax.data.types import Dataset, Frame
 from caper_jax.errors import CaperError, unknown_name
-from caper_jax.estimator import load
 from caper_jax.evaluation.records import json_line
 from caper_jax.evaluation.report import METRICS_FILE
 from caper_jax.evaluation.tracking import (
@@ -30,43 +28,9 @@ from caper_jax.evaluation.tracking import (
 )
 from caper_jax.files import write_atomically
 from caper_jax.progress import Progress, progress
-from caper_jax.tracker import Tracker, config_for
-from caper_jax.tracking.step import TrackResult
+from caper_jax.tracker import Tracker
 from caper_jax.visualization.scene import Scene
 from caper_jax.visualization.track import Tile, evenly_spaced, write_sheet, write_states
-
-
-class Recorder(Tracker):
-    """A tracker that remembers the parts of all points since its last reset, for pictures.
-
-    Attributes:
-      labels: [N] of every frame.
-    """
-
-    labels: list[Any]
-
-    def reset(self, points=None, rotation=None, translation=None, labels=None) -> None:
-        super().reset(points, rotation, translation, labels)
-        self.labels = []
-
-    def __call__(self, points, labels=None) -> TrackResult:
-        result = super().__call__(points, labels)
-        self.labels.append(result.labels)
-        return result
-
-
-def load_recorder(
-    category: str,
-    weights: Path | None,
-    config: Sequence[str],
-    object_scale: float,
-    camera_roll: float,
-) -> Recorder:
-    """The tracker of a category; see ``load_tracker``."""
-    estimator = load(category, weights, object_scale, camera_roll)
-    recorder = Recorder(estimator, config_for(estimator, *config))
-    recorder.reset()
-    return recorder
 
 
 def open_videos(
@@ -125,7 +89,7 @@ def _guess_format(data: Path) -> str:
 
 
 def track_all(
-    tracker: Recorder,
+    tracker: Tracker,
     dataset: Dataset,
     videos: dict[str, list[int]],
     out: Path,
@@ -177,7 +141,7 @@ def track_all(
 
 
 def _write_video(
-    out: Path, stem: str, track: Track, kept: dict[int, Frame], tracker: Recorder
+    out: Path, stem: str, track: Track, kept: dict[int, Frame], tracker: Tracker
 ) -> None:
     """Poses, contact sheet and curves of one video."""
     category, config = tracker.estimator.category, tracker.config
@@ -221,20 +185,12 @@ def _frames(
         bar.update(1)
 
 
-def _tile(number: int, frame: Frame, track: Track, tracker: Recorder) -> Tile:
+def _tile(number: int, frame: Frame, track: Track, tracker: Tracker) -> Tile:
     observation = tracker.observe(frame.points)
     # What a frame without the object shows is no part of it.
     shown = slice(None) if observation.present else slice(0)
-    pose, truth = jax.tree.map(lambda array: array[number], (track.pose, track.truth))
-    scene = Scene(
-        name=frame.name,
-        category=tracker.estimator.category,
-        points=observation.points[shown],
-        labels=np.asarray(tracker.labels[number])[shown],
-        pose=pose,
-        truth=truth,
-        depth=None if frame.depth is None else np.nan_to_num(frame.depth, posinf=0.0, neginf=0.0),
-        mask=frame.mask,
-        intrinsics=frame.intrinsics,
-    )
+    assert track.labels is not None  # every tracker predicts them
+    points, labels = observation.points[shown], track.labels[number][shown]
+    pose = jax.tree.map(lambda array: array[number], track.pose)
+    scene = Scene.of_frame(frame, tracker.estimator.category, points, labels, pose)
     return Tile(number, scene, bool(track.keyframe[number]), bool(track.lost[number]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from caper_jax.progress import progress
 
 BATCH_SIZE = 16
 NUM_POINTS = 1024
+Tree = TypeVar("Tree")
 
 # Poses [B, K, ...] for B frames and their clouds [B, N, 3], meters.
 Predictor = Callable[[Sequence[Frame], np.ndarray], ArticulatedPose]
@@ -94,7 +95,7 @@ def evaluate(
                 pose = jax.tree.map(lambda array, i=i: array[i], batch)
                 estimates.append(_checked(pose, frame, dataset.category))
             bar.update(len(frames))
-    estimate, truth = _stack(estimates), _stack(truths)
+    estimate, truth = stack(estimates), stack(truths)
     batches = -(-count // batch_size)
     return Evaluation(
         names=names,
@@ -117,7 +118,7 @@ def model_predictor(estimator: Callable[[np.ndarray], Any]) -> Predictor:
 
 def truth_predictor(frames: Sequence[Frame], points: np.ndarray) -> ArticulatedPose:
     """The dataset's own ground truth, which must score perfectly: else the metrics are wrong."""
-    return _stack([frame.truth for frame in frames if frame.truth is not None])
+    return stack([frame.truth for frame in frames if frame.truth is not None])
 
 
 def mean_predictor(category: Category, mean_pose: Mapping[str, Any], source: str) -> Predictor:
@@ -188,5 +189,6 @@ def _checked(pose: ArticulatedPose, frame: Frame, category: Category) -> Articul
     return ArticulatedPose(**{key: np.full(shape, np.nan) for key, shape in shapes.items()})
 
 
-def _stack(poses: Sequence[ArticulatedPose]) -> ArticulatedPose:
-    return jax.tree.map(lambda *arrays: np.stack(arrays), *poses)
+def stack(trees: Sequence[Tree]) -> Tree:
+    """Poses or results of frames as one, with a leading axis of frames; numpy arrays."""
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)

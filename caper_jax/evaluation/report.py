@@ -36,16 +36,7 @@ STATE_UNITS = {"revolute": "degrees", "prismatic": "meters"}
 _OCCLUSION = ((0.0, 0.4), (0.4, 0.8), (0.8, 1.0))
 # Closed objects look alike from several viewpoints: of a dishwasher's 90 deg, 4.5 are the first.
 _OPENING = ((0.0, 0.05), (0.05, 0.25), (0.25, 1.0))
-# Name in predictions.npz -> field of the pose.
-_ARRAYS = {
-    "R": "rotation",
-    "t": "translation",
-    "size": "size",
-    "box_center": "box_center",
-    "joint_axis": "joint_axis",
-    "joint_pivot": "joint_pivot",
-    "joint_state": "joint_state",
-}
+_SHORT = {"rotation": "R", "translation": "t"}  # names of fields in predictions.npz
 
 
 def summarize(
@@ -214,8 +205,8 @@ def write_report(folder: str | Path, evaluation: Evaluation, report: dict[str, A
         "visibility": evaluation.visibility,
     }
     for prefix, pose in (("", evaluation.estimate), ("truth_", evaluation.truth)):
-        for name, key in _ARRAYS.items():
-            arrays[prefix + name] = np.asarray(getattr(pose, key))
+        for key, values in vars(pose).items():
+            arrays[prefix + _SHORT.get(key, key)] = np.asarray(values)
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]
     folder = Path(folder)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import jax
@@ -16,13 +16,13 @@ from caper_jax.config import TrackerConfig
 from caper_jax.data.types import Frame
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.metrics import PoseErrors, pose_errors
+from caper_jax.evaluation.protocol import stack
 from caper_jax.evaluation.records import frame_record
 from caper_jax.evaluation.report import error_tables, format_tables, text_table
 from caper_jax.tracker import Tracker
 from caper_jax.tracking.step import TrackResult
 
 Start = Literal["truth", "estimator"]
-STARTS: tuple[Start, ...] = ("truth", "estimator")
 _NAME_WIDTH = 30  # of a video in a table
 
 
@@ -37,6 +37,7 @@ class Track:
       truth: likewise; None where the data have none.
       energy: [T] Eq 16, relative to the object's diagonal.
       keyframe, estimated, lost: [T] bool, see ``tracking.step.TrackResult``.
+      labels: [T, N] part of every point that the tracker took of a frame.
       seconds: [T] from points to pose, after a first call that compiles.
     """
 
@@ -49,6 +50,7 @@ class Track:
     estimated: np.ndarray
     lost: np.ndarray
     seconds: np.ndarray
+    labels: np.ndarray | None = None
 
 
 def track_video(
@@ -89,25 +91,23 @@ def track_video(
         began = time.perf_counter()
         result = jax.block_until_ready(tracker(frame.points, labels))
         seconds.append(time.perf_counter() - began)
-        results.append(jax.tree.map(np.asarray, replace(result, labels=None)))
+        results.append(jax.tree.map(np.asarray, result))
         names.append(frame.name)
         truths.append(frame.truth)
     if not results:
         raise CaperError(f"video {name!r} has no frames")
-    stacked = jax.tree.map(lambda *rows: np.stack(rows), *results)
-    known = [truth for truth in truths if truth is not None]
+    stacked = stack(results)
     return Track(
         name=name,
         frames=names,
         pose=stacked.pose,
-        truth=jax.tree.map(lambda *rows: np.stack(rows), *known)
-        if len(known) == len(truths)
-        else None,
+        truth=None if any(truth is None for truth in truths) else stack(truths),
         energy=stacked.energy,
         keyframe=stacked.keyframe,
         estimated=stacked.estimator_queried,
         lost=stacked.lost,
         seconds=np.array(seconds),
+        labels=stacked.labels,
     )
 
 

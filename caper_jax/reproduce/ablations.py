@@ -78,7 +78,7 @@ def train(
     Args:
       category: its name.
       label: of the kind, in the name of its folder under ``options.out``.
-      changes: KEY=VALUE, what makes it of this kind, besides ``options.overrides``.
+      changes: KEY=VALUE, what makes it of this kind, besides ``options.settings``.
       seed: of weights and data.
       options: give budget and start.
 
@@ -87,7 +87,7 @@ def train(
       KeyboardInterrupt: training was stopped before its budget was used up; the same call goes on.
     """
     directory = options.out / "runs" / f"{category}_{label}_{options.budget()}_seed{seed}"
-    config = override(training.preset(_PRESET, category), *options.overrides, *changes)
+    config = override(training.preset(_PRESET, category), *options.settings, *changes)
     minutes = None if options.steps else options.minutes or DEFAULT_MINUTES
     config = replace(
         config,

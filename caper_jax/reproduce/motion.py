@@ -12,6 +12,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.metrics import pose_errors
+from caper_jax.evaluation.protocol import stack
 from caper_jax.lie import so3
 from caper_jax.reproduce.data import Videos, find_models, open_videos
 from caper_jax.reproduce.options import Options
@@ -64,8 +65,8 @@ def _jitter(options: Options) -> Report:
         truths, estimates = [], []
         for name in videos.index:
             frames = list(videos.frames(name))
-            truths.append(_stack([frame.truth for frame in frames]))
-            estimates.append(_stack([estimator(frame.points).pose for frame in frames]))
+            truths.append(stack([frame.truth for frame in frames if frame.truth is not None]))
+            estimates.append(stack([estimator(frame.points).pose for frame in frames]))
         single = measure_jitter(estimates, truths, estimator.category)
         result[key] = {"frame_by_frame": single}
         tracker = Tracker(estimator, tracker_config(estimator, options))
@@ -145,11 +146,6 @@ def jitter_rows(
             row += [*(number(value, 3, factor) for value in values), number(ratio(*values), 3)]
         rows.append([*row, *(number(one["rotation_error_deg"], 2) for one in (ours, other))])
     return rows
-
-
-def _stack(poses: Sequence[Any]) -> ArticulatedPose:
-    """Poses [T, K, ...] of a video from those of its frames."""
-    return jax.tree.map(lambda *rows: np.stack([np.asarray(row) for row in rows]), *poses)
 
 
 def _modes(options: Options) -> Report:

@@ -1,60 +1,78 @@
-"""The choices of a reproduction; each takes the options it names and leaves the others."""
+"""The choices of a reproduction, from the command line; each takes those that it names.
+
+Imports nothing that takes time: ``--help`` is made of them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from caper_jax.config import GeneratorConfig, override
+import tyro
+from annotated_types import Ge, Gt
+
 from caper_jax.errors import CaperError, unknown_name
+
+if TYPE_CHECKING:
+    from caper_jax.config import GeneratorConfig
 
 SPLIT = "test"
 DEFAULT_MINUTES = 60.0
+Count = Annotated[int, Ge(1)]
+Positive = Annotated[float, Gt(0)]
 
 
 @dataclass(frozen=True)
 class Options:
-    """Choices of one run; None stands for the reproduction's own default.
+    """Measures what a table of the paper shows.
+
+    Prints the paper's figures, ours, and what ours were measured on. Writes the same as markdown
+    and JSON, and pictures of curves.
 
     Attributes:
-      out: folder of the results; generated videos and trained runs are kept there too.
-      category: a subset of the reproduction's categories; empty for all.
-      videos, frames: of each category's test set, and of each of its generated videos; frames is
-        the size of a test set where that is single frames.
-      mode: how generated videos move, see ``synthetic.videos.MODES``.
-      data, format, split: a data set to measure on instead of generated videos.
-      weights: a model directory, or a folder with one per category.
-      object_scale: see ``estimator.load``.
-      seed: of the generated frames or videos.
-      noise: of their depth, a preset of ``synthetic.sensor``.
-      given_masks: add runs with the data's part labels.
-      network_alone: track by the network's increment, without registration.
-      seeds: runs to train of each kind.
-      minutes, steps: budget of each of them; one of the two.
-      initial: model directory that each starts from, see ``training.train.train``.
-      overrides: KEY=VALUE, other settings of these runs.
+      category: a name, several with commas, or all (default: all of the table)
+      videos: per category (default: the paper's)
+      frames: of each video, or of a test set of single frames (default: the paper's, or 1,000)
+      mode: how generated videos move (default: paper)
+      data: measure on a data set instead
+      format: layout of --data, as for caper evaluate
+      split: of --data (default: test)
+      weights: model directory, or folder with one per category (default: the shipped ones)
+      object_scale: the objects are so many times as large as those the model was trained on, e.g.
+        3.7 for the laptops of PM-Videos and ArtImage (PartNet units read as meters)
+      seed: of generated frames and videos
+      noise: of generated depth (default: kinect)
+      given_masks: add rows with the data's part labels
+      network_alone: track without registration, as the paper does
+      seeds: runs to train of each kind
+      minutes: of training per run (default: 60)
+      steps: of training per run, instead of --minutes
+      initial: model that each run starts from, as for caper train (default: none)
+      out: folder of results, generated videos and runs
+      settings: of the runs, "section.key=value"
     """
 
-    out: Path
     category: tuple[str, ...] = ()
-    videos: int | None = None
-    frames: int | None = None
-    mode: str | None = None
+    videos: Count | None = None
+    frames: Count | None = None
+    mode: Literal["paper", "cam", "hard"] | None = None
     data: Path | None = None
     format: str | None = None
     split: str | None = None
     weights: Path | None = None
-    object_scale: float = 1.0
-    seed: int = 0
-    noise: str | None = None
+    object_scale: Positive = 1.0
+    seed: Annotated[int, Ge(0)] = 0
+    noise: Literal["none", "gauss3mm", "kinect", "realsense"] | None = None
     given_masks: bool = False
     network_alone: bool = False
-    seeds: int = 3
-    minutes: float | None = None
-    steps: int | None = None
-    initial: Path | None = None
-    overrides: tuple[str, ...] = ()
+    seeds: Count = 3
+    minutes: Positive | None = None
+    steps: Count | None = None
+    initial: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    out: Path = Path("outputs") / "reproduce"
+    settings: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
 
     def chosen(self, known: Iterable[str]) -> list[str]:
         """The categories to measure, in the order of ``known``.
@@ -70,7 +88,7 @@ class Options:
 
     def generator(self, config: GeneratorConfig) -> GeneratorConfig:
         """What generated frames look like: as in ``config``, with the noise of these options."""
-        return config if self.noise is None else override(config, f"noise=['{self.noise}']")
+        return config if self.noise is None else replace(config, noise=(self.noise,))
 
     def dataset(self) -> tuple[str, Path, str] | None:
         """(format, root, split) of the data set to measure on; None for generated data.

@@ -27,12 +27,14 @@ from caper_jax.visualization.scene import (
     box_corners,
     crop_box,
     depth_range,
+    joint_errors,
     joint_lines,
     joint_name,
     joint_segments,
     part_color,
+    part_errors,
+    scene_errors,
 )
-from caper_jax.visualization.table import joint_errors, part_errors, scene_errors
 
 
 def write_page(path: str | Path, scenes: Sequence[Scene], title: str = "caper_jax") -> Path:

@@ -54,10 +54,11 @@ def test_commands_have_help_with_examples(command, capsys):
 
 def class_of(module):
     """The dataclass of a command's options."""
+    names = (module.__name__.rpartition(".")[2], "options")
     return next(
         value
         for value in vars(module).values()
-        if dataclasses.is_dataclass(value) and value.__name__.lower() == module.__name__[14:]
+        if dataclasses.is_dataclass(value) and value.__name__.lower() in names
     )
 
 

@@ -11,20 +11,17 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from _helpers import tiny
 from _helpers.arm import ARM, arm_pose
 from _helpers.depth_videos import write_video
 from _helpers.frames import random_frames, random_pose
-from _helpers.quick import quick_jit
 from PIL import Image
 
 from caper_jax import categories, cli
 from caper_jax.cli import realsense, track, track_videos
-from caper_jax.config import RegistrationConfig, TrackerConfig, override
+from caper_jax.config import TrackerConfig, override
 from caper_jax.data import hdf5
 from caper_jax.data.live import pack_frame, read_frames
 from caper_jax.errors import CaperError
-from caper_jax.estimator import Estimator
 from caper_jax.evaluation.tracking import Track, format_tracks
 from caper_jax.tracker import Tracker
 from caper_jax.tracking.step import TrackResult
@@ -36,7 +33,7 @@ SHIFT = np.float32(0.002)
 CLOUD = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32) * 0.1 + [0, 0, 1]
 
 
-class Scripted(track_videos.Recorder):
+class Scripted(Tracker):
     """Says of frame i of every video the i-th pose it was given, 2 mm too far away."""
 
     def __init__(self, pose, config):
@@ -47,7 +44,7 @@ class Scripted(track_videos.Recorder):
         self.reset()
 
     def reset(self, points=None, rotation=None, translation=None, labels=None):
-        self.number, self.labels = 0, []
+        self.number = 0
         self.starts += points is not None
 
     def __call__(self, points, labels=None):
@@ -56,10 +53,9 @@ class Scripted(track_videos.Recorder):
         pose = pose.replace(translation=pose.translation + SHIFT * np.array([0, 0, 1], np.float32))
         missing = not self.observe(points).present
         self.given.append(labels)
-        self.labels.append(np.arange(POINTS) % 2)
         self.number += 1
-        number = self.number
-        return TrackResult(pose, None, np.float32(0.01 * number), number == 2, number == 2, missing)
+        second, energy = self.number == 2, np.float32(0.01 * self.number)
+        return TrackResult(pose, np.arange(POINTS) % 2, energy, second, second, missing)
 
 
 @pytest.fixture
@@ -71,7 +67,6 @@ def scripted(monkeypatch):
         made.append(Scripted(random_pose(5), override(TrackerConfig(), *config)))
         return made[-1]
 
-    monkeypatch.setattr(track_videos, "load_recorder", load)
     monkeypatch.setattr("caper_jax.tracker.load_tracker", load)
     return made
 
@@ -219,11 +214,7 @@ class TestLive:
         monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=stream, isatty=lambda: False))
 
     def test_records_are_what_the_tracker_says(self, monkeypatch, capsys):
-        network = tiny.network()
-        estimator = Estimator(BOX, network, tiny.random_variables(BOX, network))
-        few = RegistrationConfig(gaussians=16, steps=1)
-        tracker = Tracker(estimator, TrackerConfig(registration=few))
-        tracker.step = quick_jit(tracker.function)
+        tracker = Scripted(random_pose(5), TrackerConfig())
         clouds = [CLOUD, np.zeros((0, 3)), CLOUD + np.array([0.01, 0, 0])]
         self.feed(monkeypatch, b"".join(pack_frame(c, 7 + n) for n, c in enumerate(clouds)))
         monkeypatch.setattr("caper_jax.tracker.load_tracker", lambda **_: tracker)

@@ -206,7 +206,7 @@ def test_the_mean_stands_at_the_cloud_and_obeys_kinematics(path):
 
 def test_results_name_the_roll_that_the_model_was_told_of(path, tmp_path, estimator):
     for options, told in (((), False), (("--camera-roll", "-90"), True)):
-        assert run(path, tmp_path, "--frames", "5", *options) == 0
+        assert run(path, tmp_path, *options) == 0
         weights = json.loads((tmp_path / "metrics.json").read_text())["weights"]
         assert weights.endswith(", told of a camera roll of -90 deg") == told
 

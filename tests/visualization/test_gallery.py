@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 import pytest
+from _helpers.quick import quick_jit
 from matplotlib.colors import to_rgb
 from PIL import Image
 
@@ -14,7 +16,9 @@ from caper_jax.visualization.scene import part_color
 
 @pytest.fixture(scope="module")
 def box():
-    return gallery.render_instances(categories.get("box"), 3, "train", 0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax, "jit", quick_jit)
+        return gallery.render_instances(categories.get("box"), 3, "train", 0)
 
 
 def test_instances_differ_and_stand_whole_on_white(box):

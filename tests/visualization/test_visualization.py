@@ -28,8 +28,7 @@ from caper_jax.visualization import scene as scenes
 from caper_jax.visualization.page import write_page
 from caper_jax.visualization.picture import write_picture
 from caper_jax.visualization.plots import save_figure
-from caper_jax.visualization.scene import Scene
-from caper_jax.visualization.table import format_scene
+from caper_jax.visualization.scene import Scene, format_scene
 
 # A deep tree with both joint types: the third joint sits on the second link.
 INTRINSICS = np.array([[300.0, 0.0, 100.0], [0.0, 310.0, 80.0], [0.0, 0.0, 1.0]])
@@ -264,7 +263,7 @@ def test_demo_writes_pictures_and_a_page_and_prints_errors(tmp_path, monkeypatch
             evidence=np.zeros((1, 2, 6), np.float32),
         )
 
-    monkeypatch.setattr(demo, "load_estimator", lambda category: estimator)
+    monkeypatch.setattr("caper_jax.estimator.load", lambda category: estimator)
     assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 0
     captured = capsys.readouterr()
     assert max(map(len, captured.out.splitlines()[:-2])) <= 80
