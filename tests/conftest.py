@@ -28,6 +28,27 @@ jax.config.update("jax_num_cpu_devices", 8)
 install_import_hook("caper_jax", f"{_helpers.typechecker.__name__}.check")
 
 
+# Files that take longest come first, so that no worker is left alone with one at the end.
+LONGEST = (
+    "test_examples",
+    "test_tracker",
+    "test_estimator",
+    "test_train",
+    "test_objective",
+    "test_benchmarks",
+    "test_step",
+    "test_uncertainty",
+    "test_refiner",
+    "test_loop",
+    "test_export",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    rank = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
     """What one test has compiled, the others find, also in other processes of this run."""

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _helpers.quick import quick_jit
 from _helpers.tiny import network, random_like, random_variables
 from scipy.spatial.transform import Rotation
 
@@ -454,6 +453,6 @@ def test_points_of_half_precision_are_computed_with_in_float32():
     variables = random_variables(BOX, config)
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (1, 64, 3)) + [0.0, 0.0, 0.7]
     short = jnp.asarray(points, jnp.bfloat16)
-    estimated = quick_jit(lambda cloud: estimate(variables, cloud, BOX, config).pose)
+    estimated = jax.jit(lambda cloud: estimate(variables, cloud, BOX, config).pose)
     found, expected = estimated(short), estimated(short.astype(jnp.float32))
     jax.tree.map(partial(np.testing.assert_allclose, atol=1e-5), found, expected)

@@ -12,7 +12,6 @@ import sys
 import jax
 import numpy as np
 import pytest
-from _helpers.quick import quick_jit
 from _helpers.tiny import network, random_variables
 
 from caper_jax import categories, cli
@@ -96,7 +95,7 @@ def test_a_process_without_the_package_finds_the_same(drawer, tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    function = quick_jit(estimator.function)
+    function = jax.jit(estimator.function)
     alone = [function(estimator.variables, sample_points(c, 64).points[None]) for c in both]
     expected = jax.tree.map(lambda *rows: np.concatenate(rows), *alone)
     with np.load(tmp_path / "poses.npz") as found:
@@ -142,13 +141,13 @@ def test_the_weights_are_inside(drawer):
 def test_fixed_and_open_batches(tmp_path):
     estimator = estimator_of("laptop")
     points = clouds(2)
-    expected = quick_jit(estimator.function)(estimator.variables, points)
+    expected = jax.jit(estimator.function)(estimator.variables, points)
 
     def exported(folder, batch):
         manifest = export_estimator(estimator, tmp_path / folder, ("cpu", "tpu"), batch)
         assert manifest["inputs"]["points"]["shape"] == [batch or "batch", 64, 3]
         assert manifest["outputs"]["rotation"]["shape"] == [batch or "batch", 2, 3, 3]
-        return quick_jit(runpy.run_path(str(tmp_path / folder / "run.py"))["estimate"])
+        return jax.jit(runpy.run_path(str(tmp_path / folder / "run.py"))["estimate"])
 
     assert_same(exported("two", 2)(points), expected, rtol=0, atol=1e-5)
     estimate = exported("any", None)

@@ -1,15 +1,12 @@
-"""Programs that run once: compiled without optimization, in half the time, or only traced."""
+"""Programs of which shapes alone matter are traced, not compiled."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
-
-quick_jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def traced_jit(function: Callable[..., Any]) -> Callable[..., Any]:

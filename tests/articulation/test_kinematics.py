@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yourdfpy
-from _helpers.quick import quick_jit
 from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation import kinematics
@@ -25,9 +24,9 @@ TREES = {
     "tree": ("rrprpr", (0, 0, 1, 1, 3, 2)),
 }
 STATES = 6
-joint_transform = quick_jit(kinematics.joint_transform, static_argnums=0)
+joint_transform = jax.jit(kinematics.joint_transform, static_argnums=0)
 revolute, prismatic = (
-    quick_jit(f) for f in (kinematics.revolute_transform, kinematics.prismatic_transform)
+    jax.jit(f) for f in (kinematics.revolute_transform, kinematics.prismatic_transform)
 )
 
 
@@ -80,7 +79,7 @@ def test_forward_kinematics_against_urdf(name):
     root = np.eye(4)
     root[:3, :3] = Rotation.from_rotvec([0.4, -2.0, 1.0]).as_matrix()
     root[:3, 3] = [0.1, 0.2, 1.5]
-    forward = quick_jit(forward_kinematics, static_argnums=(4, 5))
+    forward = jax.jit(forward_kinematics, static_argnums=(4, 5))
     tree = types(name), TREES[name][1]
     found = forward(root, axis, pivot, state.astype(np.float32), *tree)
     assert found.shape == (STATES, len(axis) + 1, 4, 4)
@@ -93,7 +92,7 @@ def test_batches_broadcast_and_map():
     axis, pivot, state, _ = urdf_case("tree")
     tree = types("tree"), TREES["tree"][1]
     state = state.astype(np.float32)
-    mapped = quick_jit(jax.vmap(lambda s: forward_kinematics(np.eye(4), axis, pivot, s, *tree)))(
+    mapped = jax.jit(jax.vmap(lambda s: forward_kinematics(np.eye(4), axis, pivot, s, *tree)))(
         state
     )
     whole = forward_kinematics_float64(np.eye(4), axis, pivot, state, *tree)
@@ -121,15 +120,13 @@ def test_gradients_equal_finite_differences():
         return jnp.sum(poses * weights, axis=(-3, -2, -1))
 
     forward, reverse = (
-        np.asarray(quick_jit(derivative(value))(base.astype(np.float32)))
+        np.asarray(jax.jit(derivative(value))(base.astype(np.float32)))
         for derivative in (jax.jacfwd, jax.grad)
     )
     step = 1e-6
     with jax.enable_x64(True):
         size = len(base)
-        up, down = np.asarray(
-            quick_jit(value)(base + step * np.stack([np.eye(size), -np.eye(size)]))
-        )
+        up, down = np.asarray(jax.jit(value)(base + step * np.stack([np.eye(size), -np.eye(size)])))
     numerical = (up - down) / (2 * step)
     for gradient in (forward, reverse):
         assert np.abs(gradient - numerical).max() <= 1e-4 * np.abs(numerical).max()
@@ -146,7 +143,7 @@ def test_gradients_are_finite_at_every_state(joint_type):
     transform = joint_transform(joint_type, axis, np.float32([1, 2, 3]), state)
     assert jnp.isfinite(transform).all()
     np.testing.assert_array_equal(transform[1], np.tile(np.eye(4), (len(state), 1, 1)))
-    gradients = quick_jit(jax.grad(value, argnums=(0, 1, 2)))(axis, np.float32([1, 2, 3]), state)
+    gradients = jax.jit(jax.grad(value, argnums=(0, 1, 2)))(axis, np.float32([1, 2, 3]), state)
     assert all(bool(jnp.isfinite(gradient).all()) for gradient in gradients)
 
 

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 import pytest
 from _helpers import tiny
-from _helpers.quick import quick_jit
 
 from benchmarks import __main__ as benchmark
 from benchmarks import ceilings, cost_model, costs, gate, iou, processes, profile, timing, tracker
@@ -69,12 +68,11 @@ def test_rows_of_light_benchmarks(few, capsys, tmp_path):
     assert row["frames_per_s"] > 0 and row["GB/s"] > 0
 
 
-def test_the_naive_encoder_is_the_same_function(monkeypatch):
-    monkeypatch.setattr(jax, "jit", quick_jit)
+def test_the_naive_encoder_is_the_same_function():
     points = np.random.default_rng(1).normal(size=(2, 64, 3)).astype(np.float32)
     weights, ours, naive = encoders(tiny.HS, points)
     weights = tiny.random_like(jax.eval_shape(lambda: weights))
-    one, other = quick_jit(ours)(weights), quick_jit(naive)(weights)
+    one, other = jax.jit(ours)(weights), jax.jit(naive)(weights)
     np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
 
 
@@ -113,7 +111,7 @@ def test_a_random_model_of_every_preset_estimates(name):
 
 def test_costs_and_their_shares(few):
     x, y = np.ones((32, 64), np.float32), np.ones((64, 64), np.float32)
-    lowered = quick_jit(lambda x, y: x @ y).lower(x, y)
+    lowered = jax.jit(lambda x, y: x @ y).lower(x, y)
     cost = costs.of(lowered, lowered.compile())
     assert cost.flops == pytest.approx(2 * 32 * 64 * 64, rel=0.01)
     row = costs.columns(costs.Costs(4e9, None), 2.0, times=3)

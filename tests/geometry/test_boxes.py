@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _helpers.quick import quick_jit
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 from scipy.spatial.transform import Rotation
@@ -124,7 +123,7 @@ def test_axis_aligned_integer_boxes_are_exact():
     expected = common / (sizes.prod(axis=2).sum(axis=0) - common)
     assert (common == 0).any() and ((high == low).any(axis=1)).any()  # apart, and touching
     one, other = ((np.eye(3), center, size) for center, size in zip(centers, sizes, strict=True))
-    found = quick_jit(boxes.iou_full)(*one, *other)
+    found = jax.jit(boxes.iou_full)(*one, *other)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
@@ -139,11 +138,11 @@ def test_symmetric_and_independent_of_the_frame():
         plain = iou(*a, *b)
         np.testing.assert_allclose(iou(*b, *a), plain, atol=1e-12)
         np.testing.assert_allclose(iou(*moved[0], *moved[1]), plain, atol=1e-12)
-        mapped = quick_jit(jax.vmap(boxes.iou_full))(*a, *b)
+        mapped = jax.jit(jax.vmap(boxes.iou_full))(*a, *b)
         np.testing.assert_allclose(mapped, plain, atol=1e-12)
 
 
-gradients = quick_jit(jax.grad(lambda *case: boxes.iou_full(*case).sum(), argnums=tuple(range(6))))
+gradients = jax.jit(jax.grad(lambda *case: boxes.iou_full(*case).sum(), argnums=tuple(range(6))))
 
 
 def test_degenerate_boxes_give_zero():
@@ -178,12 +177,10 @@ def test_gradients_equal_finite_differences():
     case = [np.concatenate(arrays) for arrays in zip(*(pairs(k, 6) for k in kinds), strict=True)]
     count, step = len(case[0]), 1e-7
     with jax.enable_x64(True):
-        gradient = quick_jit(jax.grad(lambda *a: moved_iou(*a).sum()))(
-            jnp.zeros((count, 18)), *case
-        )
+        gradient = jax.jit(jax.grad(lambda *a: moved_iou(*a).sum()))(jnp.zeros((count, 18)), *case)
         steps = step * np.stack([np.eye(18), -np.eye(18)])[:, :, None]
         up, down = np.asarray(
-            quick_jit(moved_iou)(jnp.broadcast_to(steps, (2, 18, count, 18)), *case)
+            jax.jit(moved_iou)(jnp.broadcast_to(steps, (2, 18, count, 18)), *case)
         )
     difference = ((up - down) / (2 * step)).T
     np.testing.assert_allclose(gradient, difference, rtol=1e-4, atol=1e-6)

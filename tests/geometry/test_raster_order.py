@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _helpers.quick import quick_jit
 
 from caper_jax.geometry.raster_order import (
     from_raster_order,
@@ -17,7 +16,7 @@ from caper_jax.geometry.raster_order import (
 
 on_host_and_device = pytest.mark.parametrize(
     "order_of",
-    [raster_order, lambda points: np.asarray(quick_jit(raster_order)(jnp.asarray(points)))],
+    [raster_order, lambda points: np.asarray(jax.jit(raster_order)(jnp.asarray(points)))],
 )
 
 
@@ -102,11 +101,11 @@ def test_it_is_a_permutation_whatever_the_cloud(order_of):
 
 def test_rows_go_back_where_they_were():
     points = jnp.stack([spread(50, 1), spread(50, 2)])
-    order = quick_jit(raster_order)(points)
-    there = quick_jit(to_raster_order)(points, order)
+    order = jax.jit(raster_order)(points)
+    there = jax.jit(to_raster_order)(points, order)
     for own, cloud, sorted_cloud in zip(order, points, there, strict=True):
         np.testing.assert_array_equal(np.asarray(cloud)[np.asarray(own)], sorted_cloud)
-    np.testing.assert_array_equal(quick_jit(from_raster_order)(there, order), points)
+    np.testing.assert_array_equal(jax.jit(from_raster_order)(there, order), points)
 
     def weighted(points):
         order = raster_order(points)
@@ -115,4 +114,4 @@ def test_rows_go_back_where_they_were():
 
     place = np.argsort(np.asarray(order), axis=1)[..., None]
     expected = 2.0 * np.asarray(points) * place**2
-    np.testing.assert_allclose(quick_jit(jax.grad(weighted))(points), expected, rtol=1e-5)
+    np.testing.assert_allclose(jax.jit(jax.grad(weighted))(points), expected, rtol=1e-5)

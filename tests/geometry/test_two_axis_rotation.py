@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _helpers.quick import quick_jit
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
@@ -16,7 +15,7 @@ from caper_jax.errors import CaperError
 from caper_jax.geometry.two_axis_rotation import rotation_from_directions
 
 AXES = list(itertools.permutations("xyz", 2))
-solve = quick_jit(rotation_from_directions, static_argnames="axes")
+solve = jax.jit(rotation_from_directions, static_argnames="axes")
 
 
 def assert_rotations(rotation):
@@ -113,7 +112,7 @@ def test_degenerate_input(axes):
 def test_degenerate_input_has_finite_gradients():
     arrays = [np.array(column, np.float32) for column in zip(*DEGENERATE.values(), strict=True)]
     weights = np.arange(9.0, dtype=np.float32).reshape(3, 3)
-    gradients = quick_jit(
+    gradients = jax.jit(
         jax.grad(lambda *a: jnp.sum(rotation_from_directions(*a)[0] * weights), argnums=range(4))
     )(*arrays)
     assert all(bool(jnp.isfinite(gradient).all()) for gradient in gradients)
@@ -137,10 +136,10 @@ def test_gradients_equal_finite_differences():
         rotation, _ = rotation_from_directions(x[..., :3], x[..., 3:6], x[..., 6], x[..., 7])
         return jnp.sum(rotation * weights, axis=(-2, -1))
 
-    in_single = np.asarray(quick_jit(jax.grad(lambda x: value(x).sum()))(base.astype(np.float32)))
+    in_single = np.asarray(jax.jit(jax.grad(lambda x: value(x).sum()))(base.astype(np.float32)))
     with jax.enable_x64(True):
         steps = step * np.stack([np.eye(8), -np.eye(8)])[:, :, None]
-        up, down = np.asarray(quick_jit(value)(base + steps))
+        up, down = np.asarray(jax.jit(value)(base + steps))
     difference = ((up - down) / (2 * step)).T
     scale = np.abs(difference).max(axis=1, keepdims=True)
     assert (np.abs(in_single - difference) / scale).max() < 1e-4

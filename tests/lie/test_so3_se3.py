@@ -10,7 +10,6 @@ import jaxlie
 import mpmath as mp
 import numpy as np
 import pytest
-from _helpers.quick import quick_jit
 from scipy.spatial.transform import Rotation
 
 from caper_jax.errors import CaperError
@@ -136,7 +135,7 @@ def test_against_jaxlie():
     xi = twists().astype(np.float64)
     xi = xi[np.linalg.norm(xi[:, :3], axis=1) >= 0.9e-3]
 
-    @quick_jit
+    @jax.jit
     def errors(xi):
         # jaxlie's twists carry the translation first.
         other = jaxlie.SE3.exp(jnp.roll(xi, 3, axis=-1))
@@ -177,11 +176,11 @@ def derivatives() -> tuple[np.ndarray, dict, dict, dict]:
     xi = np.concatenate([twists(), np.stack([np.zeros(6), half_turn])]).astype(np.float32)
     zero = np.zeros(6, np.float32)
     forward, reverse = (
-        quick_jit(jax.vmap(lambda x, d=d: d(lambda c: functions(x, c))(zero)))(xi)
+        jax.jit(jax.vmap(lambda x, d=d: d(lambda c: functions(x, c))(zero)))(xi)
         for d in (jax.jacfwd, jax.jacrev)
     )
     with jax.enable_x64(True):
-        batched = quick_jit(jax.vmap(jax.vmap(functions, (None, 0)), (0, None)))
+        batched = jax.jit(jax.vmap(jax.vmap(functions, (None, 0)), (0, None)))
         values = batched(xi.astype(np.float64), step * np.concatenate([np.eye(6), -np.eye(6)]))
         values = {name: np.asarray(value) for name, value in values.items()}
     numerical = {
@@ -208,7 +207,7 @@ def test_gradients(name):
 
 def test_gradients_at_large_angles_are_finite():
     xi = np.array([[1e3, 2.0, -5.0, 1, 1, 1], [2e5, 0, 0, 1, 1, 1]], np.float32)
-    gradient = quick_jit(jax.grad(lambda x: se3.exp(x).sum()))(xi)
+    gradient = jax.jit(jax.grad(lambda x: se3.exp(x).sum()))(xi)
     assert jnp.isfinite(gradient).all()
 
 
@@ -219,10 +218,10 @@ def test_jacobians():
         product = se3.compose(se3.exp(xi + change), se3.inverse(se3.exp(xi)))
         return se3.vee(product - jnp.eye(4))
 
-    left, left_inverse = quick_jit(se3.left_jacobian), quick_jit(se3.left_jacobian_inverse)
+    left, left_inverse = jax.jit(se3.left_jacobian), jax.jit(se3.left_jacobian_inverse)
     with jax.enable_x64(True):
         numerical = jax.vmap(lambda x: jax.jacfwd(lambda c: moved(x, c))(jnp.zeros(6)))
-        numerical = np.asarray(quick_jit(numerical)(xi))
+        numerical = np.asarray(jax.jit(numerical)(xi))
         jacobian, inverse = np.asarray(left(xi)), np.asarray(left_inverse(xi))
     np.testing.assert_allclose(jacobian, numerical, atol=1e-12)
     identity = np.broadcast_to(np.eye(6), jacobian.shape)
@@ -230,8 +229,8 @@ def test_jacobians():
     assert np.abs(left(twists()) - jacobian).max() < 3e-6
     assert np.abs(left_inverse(twists()) - inverse).max() < 3e-6
     w = twists()[:, :3]
-    assert np.abs(quick_jit(so3.left_jacobian)(w) - jacobian[:, 3:, 3:]).max() < 3e-7
-    assert np.abs(quick_jit(so3.left_jacobian_inverse)(w) - inverse[:, 3:, 3:]).max() < 5e-7
+    assert np.abs(jax.jit(so3.left_jacobian)(w) - jacobian[:, 3:, 3:]).max() < 3e-7
+    assert np.abs(jax.jit(so3.left_jacobian_inverse)(w) - inverse[:, 3:, 3:]).max() < 5e-7
 
 
 def test_group_operations():
@@ -259,7 +258,7 @@ def test_group_operations():
 
 
 def test_interpolation():
-    interpolate = quick_jit(se3.interpolate)
+    interpolate = jax.jit(se3.interpolate)
     xi = np.roll(twists(), 1, axis=0)
     xi[np.linalg.norm(xi[:, :3], axis=1) > 3.1] *= 0.9
     a = exp(np.tile(np.float32([0.1, 0.2, 0.3, 1, 2, 3]), (len(xi), 1)))
@@ -267,7 +266,7 @@ def test_interpolation():
     for fraction in (0.0, 0.25, 1.0, 2.0):
         expected = compose(a, exp(fraction * xi))
         np.testing.assert_allclose(interpolate(a, b, fraction), expected, atol=1e-5)
-    turn = quick_jit(so3.interpolate)(a[:, :3, :3], b[:, :3, :3], np.full(len(xi), 0.5))
+    turn = jax.jit(so3.interpolate)(a[:, :3, :3], b[:, :3, :3], np.full(len(xi), 0.5))
     np.testing.assert_allclose(turn, interpolate(a, b, 0.5)[:, :3, :3], atol=1e-6)
 
 
@@ -276,10 +275,10 @@ def test_geodesic_distances():
     a = exp(np.roll(xi, 7, axis=0))
     b = compose(a, exp(xi))
     angle = np.linalg.norm(xi[:, :3].astype(np.float64), axis=1)
-    found = quick_jit(so3.geodesic_distance)(a[:, :3, :3], b[:, :3, :3])
+    found = jax.jit(so3.geodesic_distance)(a[:, :3, :3], b[:, :3, :3])
     np.testing.assert_allclose(found, angle, atol=1e-6)
     np.testing.assert_allclose(
-        quick_jit(se3.geodesic_distance)(a, b),
+        jax.jit(se3.geodesic_distance)(a, b),
         np.linalg.norm(xi.astype(np.float64), axis=1),
         atol=4e-6,
     )

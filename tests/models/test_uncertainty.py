@@ -9,7 +9,6 @@ import jax
 import numpy as np
 import pytest
 from _helpers.frames import random_pose
-from _helpers.quick import quick_jit
 from _helpers.tiny import network, random_variables
 from scipy.optimize import linprog
 from scipy.stats import chi
@@ -143,8 +142,7 @@ class TestModel:
         write_model(tmp_path / "box", random_variables(BOX, sizes), card)
         return tmp_path / "box"
 
-    def test_uncalibrated_models_say_nothing(self, folder, monkeypatch):
-        monkeypatch.setattr(jax, "jit", quick_jit)
+    def test_uncalibrated_models_say_nothing(self, folder):
         found = load("box", folder)(np.random.default_rng(0).normal(size=(64, 3)) + [0, 0, 2.0])
         assert found.rotation_std is found.state_std is None
         assert found.points_per_part.sum() == 64 and found.evidence.shape == (
@@ -155,7 +153,6 @@ class TestModel:
     def test_calibrate_makes_the_stated_region_hold_the_truth(
         self, folder, tmp_path, monkeypatch, capsys
     ):
-        monkeypatch.setattr(jax, "jit", quick_jit)
         monkeypatch.setattr("caper_jax.config.TRAINING_DATA", self.CONFIG)
         command = ["calibrate", "--category", "box", "--weights", str(folder), "--frames"]
         assert cli.main([*command, "20"]) == 2
@@ -177,8 +174,7 @@ class TestModel:
             assert 0.8 < shares["0.9"] < 0.98, name
         assert (tmp_path / "reliability_box.png").stat().st_size > 1000
 
-    def test_calibration_leaves_clean_depth_out_where_there_are_cameras(self, folder, monkeypatch):
-        monkeypatch.setattr(jax, "jit", quick_jit)
+    def test_calibration_leaves_clean_depth_out_where_there_are_cameras(self, folder):
         mixed = dataclasses.replace(self.CONFIG, noise=("none", "kinect", "gauss3mm"))
         found = fit_uncertainty.calibrate(load("box", folder), mixed, 320)
         alone = fit_uncertainty.calibrate(
@@ -186,10 +182,9 @@ class TestModel:
         )
         assert found["noise"] == ["kinect"] and found == alone
 
-    def test_object_scale_scales_lengths_only(self, monkeypatch):
+    def test_object_scale_scales_lengths_only(self):
         sizes = network()
         variables, card = random_variables(BOX, sizes), {"calibration": section()}
-        monkeypatch.setattr(jax, "jit", quick_jit)
         points = np.float32(np.random.default_rng(0).normal(size=(64, 3)) * 0.1 + [0, 0, 1.0])
         small = Estimator(BOX, sizes, variables, card)(points)
         large = Estimator(BOX.scaled(2.0), sizes, variables, card)(2 * points)

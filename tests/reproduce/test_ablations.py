@@ -6,10 +6,10 @@ import dataclasses
 import json
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from _helpers.frames import random_frames
-from _helpers.quick import quick_jit
 from _helpers.reproductions import cells, run
 from _helpers.tiny import network, random_variables
 from _helpers.tracks import KnownTracker, disturbed, write_videos
@@ -209,8 +209,7 @@ def test_stage_one_alone_is_the_uncorrected_root():
     alone = root_pose.stage_one(whole)
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (2, 64, 3)) + [0, 0, 0.7]
     one, other = (
-        quick_jit(model.function)(model.variables, model.sampled(points))
-        for model in (whole, alone)
+        jax.jit(model.function)(model.variables, model.sampled(points)) for model in (whole, alone)
     )
     np.testing.assert_allclose(one.confidence, other.confidence, atol=1e-6)
     assert not np.allclose(one.pose.rotation, other.pose.rotation, atol=1e-3)

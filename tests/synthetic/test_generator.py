@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _helpers.microwave import MICROWAVE
-from _helpers.quick import quick_jit
 from _helpers.shapes import outside_part
 
 from caper_jax import categories
@@ -32,7 +31,7 @@ def clean(request):
     """(category, its instances, batch of 24 clean frames)."""
     category = categories.get(request.param)
     generator = Generator(category, CLEAN)
-    draw = quick_jit(partial(generator.draw, batch_size=24))
+    draw = jax.jit(partial(generator.draw, batch_size=24))
     batch, again, other = (draw(jax.random.key(seed), bank=generator.bank) for seed in (1, 1, 2))
     np.testing.assert_array_equal(again.points, batch.points)
     assert not np.array_equal(other.points, batch.points)
@@ -93,7 +92,7 @@ def test_picks_follow_one_another_evenly_along_the_scan():
     hits = order[hit.ravel()[order]]
     for count in (300, 5000):
         picked = np.asarray(
-            quick_jit(partial(systematic_sample, count=count))(jax.random.key(0), hit)
+            jax.jit(partial(systematic_sample, count=count))(jax.random.key(0), hit)
         )
         place = np.argsort(hits)[np.searchsorted(np.sort(hits), picked)]
         np.testing.assert_array_equal(hits[place], picked)
@@ -134,7 +133,7 @@ def test_states_cover_each_instance_range():
     category = categories.get("laptop")
     bank = build_bank(draw_instances(category, 50, "train", 0))
     bank = jax.tree.map(lambda values: np.repeat(values, 8, axis=0), bank)
-    draw = quick_jit(jax.vmap(partial(draw_state_and_poses, category=category)))
+    draw = jax.jit(jax.vmap(partial(draw_state_and_poses, category=category)))
     state, _, _ = draw(jax.random.split(jax.random.key(0), 400), bank)
     low, high = bank.limits[..., 0], bank.limits[..., 1]
     share = (np.asarray(state) - low) / (high - low)

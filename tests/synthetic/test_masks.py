@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _helpers.microwave import MICROWAVE
-from _helpers.quick import quick_jit
 from _helpers.shapes import outside_part
 
 from caper_jax import categories
@@ -35,7 +34,7 @@ RAYS = (jnp.asarray((COLUMNS - 32) / 200.0), jnp.asarray((ROWS - 32) / 200.0))
 def over_keys(function):
     """The function's results for many keys, as numpy arrays."""
     keys = jax.random.split(jax.random.key(0), KEYS)
-    return jax.tree.map(np.asarray, quick_jit(jax.vmap(function))(keys))
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(function))(keys))
 
 
 def distance_to(pixels):
@@ -208,7 +207,7 @@ def plain():
 def draw(config):
     """24 frames of ovens, as numpy arrays."""
     generator = Generator(MICROWAVE, config)
-    draw = quick_jit(partial(generator.draw, batch_size=24))
+    draw = jax.jit(partial(generator.draw, batch_size=24))
     return jax.tree.map(np.asarray, draw(jax.random.key(0), bank=generator.bank))
 
 

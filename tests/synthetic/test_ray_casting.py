@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _helpers.quick import quick_jit
 from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.category import ObjectModel
@@ -71,7 +70,7 @@ class Scene:
         low, high = (-0.4, -0.3, 0.6), (0.4, 0.3, 2.0)
         self.poses[..., :3, 3] = rng.uniform(low, high, (DRAWS, parts, 3))
         groups = jax.tree.map(jnp.asarray, self.bank.groups)
-        self.seen = jax.tree.map(np.asarray, quick_jit(self._look)(groups, self.poses))
+        self.seen = jax.tree.map(np.asarray, jax.jit(self._look)(groups, self.poses))
 
     @staticmethod
     def _look(groups, poses):
@@ -194,9 +193,9 @@ def test_nearest_part_wins_and_parts_are_seen_alone():
     groups = jax.tree.map(lambda values: jnp.asarray(values[0]), bank.groups)
     poses = jnp.tile(jnp.eye(4).at[2, 3].set(1.0), (2, 1, 1))
     rays = (jnp.array([0.0, 0.11, -0.09, 0.3]), jnp.zeros(4))
-    alone = quick_jit(part_depths)(groups, poses, rays)
+    alone = jax.jit(part_depths)(groups, poses, rays)
     np.testing.assert_allclose(alone, [[0.99, FAR, 0.99, FAR], [1.19, 1.19, FAR, FAR]], rtol=1e-6)
-    depth, part = quick_jit(cast)(groups, poses, rays)
+    depth, part = jax.jit(cast)(groups, poses, rays)
     np.testing.assert_allclose(depth, [0.99, 1.19, 0.99, FAR], rtol=1e-6)
     assert part.tolist() == [0, 1, 0, -1]
 
@@ -206,6 +205,6 @@ def test_the_inside_of_a_hollow_solid_is_seen_from_within_its_hole():
     nothing = np.zeros((0, 3))
     bank = build_bank([ObjectModel([[room]], nothing, nothing, nothing[:, :2])])
     groups = jax.tree.map(lambda values: jnp.asarray(values[0]), bank.groups)
-    depth, part = quick_jit(cast)(groups, jnp.eye(4)[None], (jnp.array([0.0, 0.5]), jnp.zeros(2)))
+    depth, part = jax.jit(cast)(groups, jnp.eye(4)[None], (jnp.array([0.0, 0.5]), jnp.zeros(2)))
     np.testing.assert_allclose(depth, 1.5, rtol=1e-6)
     assert part.tolist() == [0, 0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 
@@ -13,7 +14,6 @@ pytest.importorskip("yourdfpy")
 
 import trimesh
 import yourdfpy
-from _helpers.quick import quick_jit
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories
@@ -47,7 +47,7 @@ def test_links_move_as_the_parts_do(exported):
     names = link_names(robot)
     assert len(names) == category.num_parts and robot.base_link == names[0]
     tree = (category.joint_types, category.parents)
-    place = quick_jit(lambda s: forward_kinematics(np.eye(4), model.axis, model.pivot, s, *tree))
+    place = jax.jit(lambda s: forward_kinematics(np.eye(4), model.axis, model.pivot, s, *tree))
     rng = np.random.default_rng(0)
     for _ in range(5):
         state = rng.uniform(model.limits[:, 0], model.limits[:, 1])

@@ -13,7 +13,6 @@ pytest.importorskip("trimesh")
 pytest.importorskip("embreex")
 pytest.importorskip("yourdfpy")
 
-from _helpers.quick import quick_jit
 from _helpers.shapes import outside_part
 from _helpers.solid_meshes import mesh_object
 from _helpers.urdf_models import partnet_drawer, partnet_laptop
@@ -59,8 +58,8 @@ def test_frames_are_those_of_the_generator(rendered):
     """Same keys: the same states and cameras; every point where the exact caster has it."""
     models, batch = rendered
     bank = build_bank(models)
-    draw = quick_jit(partial(draw_state_and_poses, category=LAPTOP))
-    trace = quick_jit(cast)
+    draw = jax.jit(partial(draw_state_and_poses, category=LAPTOP))
+    trace = jax.jit(cast)
     for index in range(FRAMES):
         instance = jax.tree.map(lambda values, i=index: values[i % 2], bank)
         key = jax.random.split(jax.random.fold_in(jax.random.key(3), index), 8)[0]

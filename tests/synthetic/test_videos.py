@@ -8,7 +8,6 @@ import jax
 import numpy as np
 import pytest
 from _helpers.microwave import MICROWAVE
-from _helpers.quick import quick_jit
 from _helpers.shapes import outside_part
 from scipy.spatial.transform import Rotation
 
@@ -33,7 +32,7 @@ def batches():
     """Mode -> (generator, Batch [V, T, ...]); one compiled program serves all modes."""
     found = {}
     settings = (MICROWAVE, CONFIG, FRAMES, VIDEOS)
-    draw = quick_jit(lambda key, bank, motion: videos._batch(key, bank, motion, *settings))
+    draw = jax.jit(lambda key, bank, motion: videos._batch(key, bank, motion, *settings))
     for mode in MODES:
         generator = VideoGenerator(MICROWAVE, CONFIG, mode, FRAMES)
         generator.draw = partial(draw, bank=generator.bank, motion=generator._motion)
@@ -140,7 +139,7 @@ def test_cameras_may_be_turned_about_their_axes():
         )
         return [camera_pose(camera, level, 0.7) for camera in cameras]
 
-    first, second = quick_jit(jax.vmap(poses))(jax.random.split(jax.random.key(0), 20))
+    first, second = jax.jit(jax.vmap(poses))(jax.random.split(jax.random.key(0), 20))
     # x right, y down: a turn about z is clockwise in the image.
     turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     np.testing.assert_allclose(second[:, :3], turn @ first[:, :3], atol=1e-5)
@@ -155,7 +154,7 @@ def test_cameras_of_arcs_stay_in_their_ranges():
         cameras = camera_arc(move, draw_camera(draw, view), view, 20, 2.0)
         return cameras, jax.vmap(lambda camera: camera_pose(camera, view, 0.7))(cameras)
 
-    cameras, poses = quick_jit(jax.vmap(arc))(jax.random.split(jax.random.key(0), 200))
+    cameras, poses = jax.jit(jax.vmap(arc))(jax.random.split(jax.random.key(0), 200))
     for values, (low, high) in (
         (np.degrees(cameras.azimuth), view.azimuth),
         (np.degrees(cameras.elevation), view.elevation),

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _helpers.quick import quick_jit
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
@@ -126,7 +125,7 @@ def own_points(name: str, count: int, seed: int):
     return points * sizes[labels] + centers[labels], labels.astype(np.int32)
 
 
-extend = quick_jit(extend_surface, static_argnums=3)
+extend = jax.jit(extend_surface, static_argnums=3)
 
 
 @cache
@@ -246,7 +245,7 @@ def test_part_poses_are_forward_kinematics(parents):
     rng = np.random.default_rng(5)
     before, after = np.float32(rng.normal(size=(2, 3)))
 
-    @quick_jit
+    @jax.jit
     def both(poses, state):
         joints = tree.axis, tree.pivot, state, tree.types, parents
         return PartPoses(tree, before, poses).at(state), forward_kinematics(jnp.eye(4), *joints)
@@ -264,7 +263,7 @@ class TestRegister:
     def test_finds_a_known_motion(self, name):
         """Other points of the same faces, moved; without anything to expect."""
         surface, parts, cloud, labels, start, (root, state) = seen(name)
-        run = quick_jit(partial(register, expected=(), config=RegistrationConfig(steps=8)))
+        run = jax.jit(partial(register, expected=(), config=RegistrationConfig(steps=8)))
         found, joints, information = run(surface, parts, cloud, labels, start)
         degrees, shift = turn_and_shift(found, root)
         assert degrees < 0.1 and shift < 0.005
@@ -283,7 +282,7 @@ class TestRegister:
         away = [0.0, 0.0, 0.05, 0.03, -0.04, 0.02]
         expected = np.float32(twist(away)), np.float32([0.3])
         sigma = np.float32([0.01] * 7)
-        found, joints, _ = quick_jit(partial(register, config=CONFIG))(
+        found, joints, _ = jax.jit(partial(register, config=CONFIG))(
             surface, parts, points[::4], np.zeros(512, np.int32), start, ((expected, sigma),)
         )
         truth = expected[0].copy()
@@ -303,7 +302,7 @@ class TestRegister:
             parts = PartPoses(parts.tree, wide(parts.state) - 0.1, wide(parts.poses) @ odd)
             cloud = np.asarray(cloud[:100], float)
 
-            @quick_jit
+            @jax.jit
             def linearized(step):
                 pose = se3.compose(root, se3.exp(step[:6])), state + step[6:]
                 about = surface, parts, cloud, labels[:100], *pose, CONFIG
@@ -322,7 +321,7 @@ class TestRegister:
 
 def test_mismatch_is_nothing_at_the_truth_and_one_far_away():
     surface, parts, cloud, labels, start, truth = seen("hinge")
-    found = quick_jit(partial(match_cost, config=CONFIG))
+    found = jax.jit(partial(match_cost, config=CONFIG))
     assert found(surface, parts, cloud, labels, truth) < 0.01
     assert 0.1 < found(surface, parts, cloud, labels, start) < 0.9
     assert found(surface, parts, cloud + np.float32([0, 0, 2]), labels, truth) > 0.99
@@ -368,7 +367,7 @@ class TestHoldStill:
         assert self.share([0, 0, 0, 0, 0.1, 0], information) == pytest.approx(0.91, abs=1e-3)
 
 
-hold = quick_jit(suppress_jitter)
+hold = jax.jit(suppress_jitter)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

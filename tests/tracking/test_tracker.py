@@ -8,7 +8,6 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from _helpers.quick import quick_jit
 from _helpers.tiny import network, random_variables
 from scipy.spatial.transform import Rotation
 
@@ -31,24 +30,20 @@ def videos():
     """Batch [V, T, ...] of unseen laptops before a static camera with a sensor's noise."""
     config = GeneratorConfig(instances=8, grid=64, noise=("kinect",))
     generator = VideoGenerator(LAPTOP, config, "paper", FRAMES, split="test")
-    draw = quick_jit(partial(generator.batch, videos=VIDEOS))
+    draw = jax.jit(partial(generator.batch, videos=VIDEOS))
     return jax.tree.map(np.asarray, draw(jax.random.key(0)))
 
 
 @pytest.fixture(scope="module")
 def tracker():
     """One, so that its step is compiled once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax, "jit", quick_jit)
-        return load_tracker("laptop")
+    return load_tracker("laptop")
 
 
 def undoubting(tracker, **settings):
     """That tracker, but it asks the estimator on trial only."""
     settings = replace(tracker.config, policy="promote", patience=1000, **settings)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax, "jit", quick_jit)
-        return Tracker(tracker.estimator, settings)
+    return Tracker(tracker.estimator, settings)
 
 
 class Player:
@@ -266,7 +261,7 @@ def test_scans_loops_vmaps_and_slopes():
             found = toy(variables | {"params": params}).track(observations, begin)
             return sum((weights[name] * getattr(found.pose, name)).sum() for name in weights), found
 
-        differentiate = quick_jit(jax.grad(weighed, argnums=(0, 1), has_aux=True))
+        differentiate = jax.jit(jax.grad(weighed, argnums=(0, 1), has_aux=True))
 
         def directed(leaf):
             direction = rng.normal(size=leaf.shape)
@@ -309,7 +304,7 @@ def test_scans_loops_vmaps_and_slopes():
         scans = jax.tree.map(lambda *leaves: np.stack(leaves), *scans)
         assert scans.keyframe.sum() > 4 and scans.estimator_queried.sum() > 4
         np.testing.assert_array_equal(scans.lost, [~present] * 2)
-        step = quick_jit(jax.vmap(partial(tracker.function, variables)))
+        step = jax.jit(jax.vmap(partial(tracker.function, variables)))
         states = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), begin)
         for number in range(frames):
             frame = Observation(clouds[:, number], present[[number] * 2], labels[[number] * 2])

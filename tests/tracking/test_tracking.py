@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from _helpers.quick import quick_jit
 from scipy.linalg import expm
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -51,7 +50,7 @@ def angle(one, other):
 
 
 class TestEnergy:
-    energy = staticmethod(quick_jit(chamfer_energy, static_argnums=4))
+    energy = staticmethod(jax.jit(chamfer_energy, static_argnums=4))
 
     def clouds(self):
         rng = np.random.default_rng(0)
@@ -91,7 +90,7 @@ class TestEnergy:
     def test_equal_clouds_cost_nothing(self):
         first, labels, *_ = self.clouds()
         assert self.energy(first, labels, first, labels, 3, 1.0) == 0
-        slopes = quick_jit(jax.grad(partial(chamfer_energy, num_parts=3)))
+        slopes = jax.jit(jax.grad(partial(chamfer_energy, num_parts=3)))
         found = slopes(first, labels, first, labels, size=1.0)
         assert np.isfinite(found).all()
 
@@ -99,7 +98,7 @@ class TestEnergy:
 class TestJointsFromPoses:
     AXIS = np.array([unit([0.2, 1.0, -0.3]), unit([0.1, -0.4, 1.0])])
     PIVOT = np.array([[0.3, -0.2, 0.4], [0.0, 0.0, 0.0]])
-    fit = staticmethod(quick_jit(partial(joints_from_poses, category=DOOR)))
+    fit = staticmethod(jax.jit(partial(joints_from_poses, category=DOOR)))
 
     def parts(self, turn, slide):
         """[3, 4, 4] poses in the root's frame."""
@@ -167,7 +166,7 @@ class TestJointsFromPoses:
             states, parameters = joints_from_poses(parts, votes, DOOR)
             return states.sum() + parameters.axis.sum() + parameters.pivot.sum()
 
-        slopes = quick_jit(jax.grad(total, argnums=(0, 1)))
+        slopes = jax.jit(jax.grad(total, argnums=(0, 1)))
         for turn, slide in ((0.0, 0.0), (0.5, 0.2)):
             found = slopes(self.parts(turn, slide), self.votes(*self.wrong()))
             assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
@@ -179,8 +178,8 @@ SIZES = {"lie": 6, "euclidean": 9}  # numbers of an increment
 class TestIncrement:
     """Transforms as numbers of a network, and back."""
 
-    transform = staticmethod(quick_jit(increment_transform, static_argnums=1))
-    numbers = staticmethod(quick_jit(increment_numbers, static_argnums=1))
+    transform = staticmethod(jax.jit(increment_transform, static_argnums=1))
+    numbers = staticmethod(jax.jit(increment_numbers, static_argnums=1))
 
     @pytest.mark.parametrize("kind", SIZES)
     def test_round_trip(self, kind):
@@ -194,7 +193,7 @@ class TestIncrement:
     def test_zeros_are_the_identity_with_finite_slopes(self, kind):
         zeros = np.zeros(SIZES[kind], np.float32)
         np.testing.assert_array_equal(self.transform(zeros, kind), np.eye(4))
-        slopes = quick_jit(jax.jacobian(partial(increment_transform, kind=kind)))(zeros)
+        slopes = jax.jit(jax.jacobian(partial(increment_transform, kind=kind)))(zeros)
         assert np.isfinite(slopes).all()
         # Six degrees of freedom.
         assert np.linalg.matrix_rank(np.asarray(slopes).reshape(16, -1)) == 6
@@ -270,7 +269,7 @@ def in_camera(points, fix: PoseMeasurement):
 
 
 class TestBoxResidual:
-    measure = staticmethod(quick_jit(box_residual))
+    measure = staticmethod(jax.jit(box_residual))
 
     def test_points_in_their_boxes_fit(self):
         fix = laptop_fix(ROOT, 0.5)
@@ -333,7 +332,7 @@ class TestUpdateKeyframe:
                         static, points, None, tracked, box_residual(tracked, points), state, *rest
                     )
 
-                programs[key] = quick_jit(update)
+                programs[key] = jax.jit(update)
             points = in_camera(INSIDE, tracked if fits == "track" else static)
             state = {"variance": np.float32(variance) * np.ones(3, np.float32), "lost": lost}
             state |= {
@@ -435,7 +434,7 @@ class TestUpdateKeyframe:
 
 
 class TestUpdateParameters:
-    mean = staticmethod(quick_jit(update_parameters))
+    mean = staticmethod(jax.jit(update_parameters))
 
     def frames(self, count):
         """ObjectParameters of two joints, as noisy as networks see them."""

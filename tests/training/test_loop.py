@@ -318,7 +318,8 @@ def start_worker(directory, output):
     code = f"import test_loop as t; t.worker({str(directory)!r}, {str(output)!r})"
     return subprocess.Popen(
         [sys.executable, "-c", code],
-        env={**os.environ, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu"},
+        # The shared cache of programs would keep what a killed process had half written.
+        env={**os.environ, "PYTHONPATH": path, "JAX_ENABLE_COMPILATION_CACHE": "false"},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _helpers.objectives import BOX, DEEP, THIN, frames
-from _helpers.quick import quick_jit
 from _helpers.tiny import network, random_variables
 
 from caper_jax.config import RotationClassifierConfig
@@ -113,7 +112,7 @@ def test_the_gradients_of_the_networks_are_the_same_with_and_without():
     state = {"batch_stats": variables["batch_stats"]}
     rest = (state, frames(BOX, [THIN, DEEP]), jax.random.key(1), 0.0)
     (one, gradients), (other, expected) = (
-        quick_jit(transform(objective, has_aux=True))(variables["params"], *rest)
+        jax.jit(transform(objective, has_aux=True))(variables["params"], *rest)
         for transform in (memory.value_and_grad, jax.value_and_grad)
     )
     assert_close(one, other, 1e-4)

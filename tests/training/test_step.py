@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _helpers.objectives import BOX, DEEP, THIN, frames
-from _helpers.quick import quick_jit
 from _helpers.tiny import network, random_variables
 
 from caper_jax.config import LossConfig, LossWeights
@@ -127,8 +126,8 @@ def test_variants_of_the_objective_train_side_by_side():
         return train_step(state, cloud, loss_fn=objective, optimizer=optimizer)
 
     seeds, twists, rates = SEEDS[:2], jnp.array([1.0, 5.0]), jnp.array([1e-3, 1e-2])
-    states, metrics = quick_jit(jax.vmap(one))(seeds, twists, rates)
-    alone = quick_jit(one)
+    states, metrics = jax.jit(jax.vmap(one))(seeds, twists, rates)
+    alone = jax.jit(one)
     for number in range(2):
         state, single = alone(seeds[number], twists[number], rates[number])
         np.testing.assert_allclose(metrics["loss"][number], single["loss"], rtol=1e-3)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 import pytest
-from _helpers.quick import quick_jit
 from matplotlib.colors import to_rgb
 from PIL import Image
 
@@ -16,9 +14,7 @@ from caper_jax.visualization.scene import part_color
 
 @pytest.fixture(scope="module")
 def box():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax, "jit", quick_jit)
-        return gallery.render_instances(categories.get("box"), 3, "train", 0)
+    return gallery.render_instances(categories.get("box"), 3, "train", 0)
 
 
 def test_instances_differ_and_stand_whole_on_white(box):
