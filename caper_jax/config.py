@@ -234,6 +234,21 @@ class GeneratorConfig:
       dropout: largest fraction of lone pixels without depth; each frame draws its own.
       holes: rate of frames with 1 to 4 blobs without depth.
       depth_scale: standard deviation of the camera's relative error of all depths, one per frame.
+      specks: largest fraction of points that lie anywhere in a ball around the object, of 1.5
+        times its radius; each frame draws its own. These points have label -1.
+      speckle: largest fraction of points that are moved along their rays, nearer or farther, by a
+        tenth of the object's diagonal on average; each frame draws its own. These have label -1.
+      flying: largest fraction of flying pixels among those where the depth jumps to something
+        behind: they lie anywhere between the two; each frame draws its own. They have label -1.
+      rim: rate of frames whose mask is too wide all around, by 1.5 to 8 % of the grid's side, and
+        takes in the table or, in half of all frames, a wall; the rest of the rim has no depth.
+        These points have label -1.
+      hand: rate of frames with a hand that touches the object and hides what is behind it: in the
+        mask, with label -1, or not, one as often as the other.
+      cable: rate of frames with a cable: in front of the object, in the mask (label -1) or not, or
+        right behind it and in the mask, each as often as the others.
+      few_points: rate of frames with fewer distinct points, from 48 (log-uniform), repeated evenly;
+        in half of them 70 to 95 % of these are of one part.
       measure_visibility: fill ``Batch.visibility``.
     """
 
@@ -251,6 +266,13 @@ class GeneratorConfig:
     dropout: Fraction = 0.0
     holes: Fraction = 0.0
     depth_scale: Annotated[float, Ge(0), Le(0.1)] = 0.0
+    specks: Fraction = 0.0
+    speckle: Fraction = 0.0
+    flying: Fraction = 0.0
+    rim: Fraction = 0.0
+    hand: Fraction = 0.0
+    cable: Fraction = 0.0
+    few_points: Fraction = 0.0
     measure_visibility: bool = False
 
 

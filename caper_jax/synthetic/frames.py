@@ -20,7 +20,7 @@ from caper_jax.data.types import Batch
 from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.geometry.raster_order import grid_raster_order
 from caper_jax.progress import progress
-from caper_jax.synthetic import masks
+from caper_jax.synthetic import disturbances, masks
 from caper_jax.synthetic import sensor as sensors
 from caper_jax.synthetic.camera import camera_pose, draw_camera
 from caper_jax.synthetic.instances import InstanceBank, build_bank, draw_instances, split_key
@@ -28,6 +28,7 @@ from caper_jax.synthetic.ray_casting import FAR, nearest_part, part_depths, proj
 
 FRAMES_AT_A_TIME = 25  # what the frames of a seed are depends on it
 _MARGIN = 0.04  # of the object's projected box, on each side
+_WIDE_MARGIN = 0.1  # holds a rim of 8 % of the grid's side, which has both margins in it
 
 
 def systematic_sample(key: PRNGKeyArray, hit: Bool[Array, "G G"], count: int) -> Int[Array, " N"]:
@@ -152,7 +153,21 @@ def observe(
     flat = (rays[0].ravel(), rays[1].ravel())
     alone = part_depths(instance.groups, poses, flat)
     depth, part = (image.reshape(rays[0].shape) for image in nearest_part(alone))
-    depth, part, hit = _apply_mask(keys.mask, depth, part, instance, poses, rays, category, config)
+    diagonal = rest_diagonal(instance.size, instance.box_center)
+    behind = None
+    if config.rim > 0 or config.hand > 0 or config.cable > 0 or config.flying > 0:
+        behind = disturbances.background(
+            jax.random.fold_in(keys.mask, 16),
+            instance,
+            poses,
+            category.viewpoint,
+            diagonal,
+            rays,
+            config.rim > 0,
+        )
+    depth, part, hit = _apply_mask(
+        keys.mask, depth, part, behind, instance, poses, rays, category, config
+    )
     visible = jnp.stack([(hit & (part == k)).sum() for k in range(category.num_parts)])
     visibility = None
     if config.measure_visibility:
@@ -172,9 +187,13 @@ def observe(
     chosen = jax.tree.map(lambda image: image.ravel()[index], surface)
     points = sensors.measure(keys.noise, sensor, chosen, (flat[0][index], flat[1][index]))
     labels = part.ravel()[index]
+    if config.flying > 0:
+        reach = disturbances.jump_reach(depth, behind, diagonal).ravel()[index]
+        fly_key = jax.random.fold_in(keys.noise, 16)
+        points, labels = disturbances.fly(fly_key, points, labels, reach, config.flying)
     if config.residue > 0:
-        diagonal = rest_diagonal(instance.size, instance.box_center)
         points, labels = _add_residue(keys.residue, points, labels, diagonal, config.residue)
+    points, labels = _add_stray(keys, points, labels, instance, poses, diagonal, config)
     if config.depth_scale > 0:
         error = jax.random.normal(jax.random.fold_in(keys.sensor, 1))
         points *= 1.0 + config.depth_scale * jnp.clip(error, -3.0, 3.0)
@@ -182,12 +201,31 @@ def observe(
     return Batch(points, labels, pose, visible, None, visibility)
 
 
+def _add_stray(keys: FrameKeys, points, labels, instance, poses, diagonal, config):
+    """Points and labels with speckle and specks, or fewer of them."""
+    if config.speckle > 0:
+        key = jax.random.fold_in(keys.residue, 16)
+        points, labels = disturbances.add_speckle(key, points, labels, diagonal, config.speckle)
+    if config.specks > 0:
+        key = jax.random.fold_in(keys.residue, 17)
+        center = disturbances.object_center(instance, poses)
+        points, labels = disturbances.add_specks(
+            key, points, labels, center, diagonal, config.specks
+        )
+    if config.few_points > 0:
+        key = jax.random.fold_in(keys.pick, 16)
+        index = disturbances.thin_out(key, labels, len(poses), config.few_points)
+        points, labels = points[index], labels[index]
+    return points, labels
+
+
 def _ray_grid(key, instance: InstanceBank, poses, config: GeneratorConfig):
     """Rays (x [G, G], y [G, G]) over the object's projection, with a random sub-pixel offset."""
     low, high = projected_bounds(instance.groups, poses)
-    if config.table > 0 or config.clutter > 0:
+    if config.table > 0 or config.clutter > 0 or config.rim > 0:
         # Room for what a mask that is too wide takes in.
-        low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
+        margin = _WIDE_MARGIN if config.rim > 0 else _MARGIN
+        low, high = low - margin * (high - low), high + margin * (high - low)
     steps = jnp.arange(config.grid) + 0.0
     offset = jax.random.uniform(key, (2,))
     x = low[0] + (steps + offset[0]) / config.grid * (high[0] - low[0])
@@ -199,6 +237,7 @@ def _apply_mask(
     key,
     depth,
     part,
+    behind,
     instance: InstanceBank,
     poses,
     rays,
@@ -209,6 +248,19 @@ def _apply_mask(
     hit = part >= 0
     if config.occlusion > 0:
         hit = masks.occlude(key, hit, config.occlusion, config.occluders)
+    scene = disturbances.Scene(depth, part, hit, behind)
+    diagonal = rest_diagonal(instance.size, instance.box_center)
+    if config.hand > 0:
+        center = disturbances.object_center(instance, poses)
+        scene = disturbances.add_hand(
+            jax.random.fold_in(key, 17), scene, center, diagonal, rays, config.hand
+        )
+    if config.cable > 0:
+        cable_key = jax.random.fold_in(key, 18)
+        scene = disturbances.add_cable(cable_key, scene, diagonal, rays, config.cable)
+    if config.rim > 0:
+        scene = disturbances.widen(jax.random.fold_in(key, 19), scene, config.rim)
+    depth, part, hit, _ = scene
     if config.table > 0 or config.clutter > 0:
         table = masks.table_depth(instance, poses, category.viewpoint, rays)
     if config.table > 0:
@@ -226,7 +278,7 @@ def _apply_mask(
             part,
             hit,
             table,
-            rest_diagonal(instance.size, instance.box_center),
+            diagonal,
             rays,
             config.clutter,
             config.spill,

@@ -28,7 +28,12 @@ _KEPT = 0.3  # an object of which less would stay is left as it is
 
 def keep_most(remaining: Bool[Array, "G G"], hit: Bool[Array, "G G"]) -> Bool[Array, "G G"]:
     """``remaining`` [G, G], or ``hit`` where too little of it would be left."""
-    return jnp.where(remaining.sum() > _KEPT * hit.sum(), remaining, hit)
+    return jnp.where(enough(remaining, hit), remaining, hit)
+
+
+def enough(remaining: Bool[Array, "G G"], whole: Bool[Array, "G G"]) -> Bool[Array, ""]:
+    """Whether over 30 % of the pixels [G, G] remain."""
+    return remaining.sum() > _KEPT * whole.sum()
 
 
 def occlude(
