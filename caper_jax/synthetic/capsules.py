@@ -60,48 +60,47 @@ def capsule_depth(capsules: Capsules, rays: Sequence[Float[Any, " *R"]]) -> Floa
     return jax.lax.scan(nearest, jnp.full(jnp.shape(x), FAR), capsules)[0]
 
 
+def hand_scale(diagonal: float | Float[Any, ""]) -> Float[Array, ""]:
+    """1, less in proportion for objects with a diagonal below 25 cm."""
+    return jnp.minimum(1.0, diagonal / _HAND_M)
+
+
 def hand_capsules(
-    uniform: Float[Any, " 8"],
+    uniform: Float[Any, " 6"],
     touch: Float[Any, " 3"],
-    center: Float[Any, " 3"],
-    diagonal: float | Float[Any, ""],
+    along: Float[Any, " 3"],
+    scale: float | Float[Any, ""],
 ) -> Capsules:
     """A hand of five capsules: up to three fingers, the palm and the forearm.
 
-    Fingers are 15 to 25 mm thick and 50 to 90 mm long; all is smaller in proportion for objects of
-    less than 25 cm. The hand comes from outside the object's projection and from the camera's side.
+    Fingers are 15 to 25 mm thick and 50 to 90 mm long, times ``scale``.
 
     Args:
-      uniform: eight numbers in [0, 1).
+      uniform: six numbers in [0, 1).
       touch: [3] the point that the tip of the first finger touches.
-      center: [3] the object's, from which the hand points away.
-      diagonal: of the object at rest, meters.
+      along: [3] unit vector from the tip to the knuckle.
+      scale: of all lengths but the forearm's, see ``hand_scale``.
     """
-    scale = jnp.minimum(1.0, diagonal / _HAND_M)
     radius = scale * (0.0075 + 0.005 * uniform[0])
     length = scale * (0.05 + 0.04 * uniform[1])
     sight = touch / jnp.linalg.norm(touch)
-    outward = touch[:2] / touch[2] - center[:2] / center[2]
-    angle = jnp.arctan2(outward[1], outward[0]) + 2 * jnp.pi / 3 * (uniform[2] - 0.5)
-    along = jnp.stack([jnp.cos(angle), jnp.sin(angle), -0.1 - 0.9 * uniform[3]])
-    along /= jnp.linalg.norm(along)
     side = jnp.cross(along, sight)
     side /= jnp.linalg.norm(side)
 
     # Fingers that are not there coincide with the first one.
-    number = jnp.floor(3 * uniform[4])
+    number = jnp.floor(3 * uniform[2])
     place = 2.2 * radius * jnp.where(jnp.arange(3) <= number, jnp.array([0.0, 1.0, -1.0]), 0.0)
-    lag = jnp.where(place == 0, 0.0, 0.3 * length * uniform[5])
+    lag = jnp.where(place == 0, 0.0, 0.3 * length * uniform[3])
     first = touch - radius * sight
     tips = first + place[:, None] * side + lag[:, None] * along
     knuckles = first + place[:, None] * side + length * along
-    palm = scale * (0.03 + 0.01 * uniform[6])
+    palm = scale * (0.03 + 0.01 * uniform[4])
     wrist = first + (length + 0.5 * palm) * along, first + (length + 2.5 * palm) * along
     elbow = wrist[1] + jnp.minimum(0.4, 0.4 * touch[2]) * along
     return Capsules(
         jnp.concatenate([tips, jnp.stack(wrist)]),
         jnp.concatenate([knuckles, jnp.stack([wrist[1], elbow])]),
-        jnp.stack([radius, radius, radius, palm, (0.7 + 0.2 * uniform[7]) * palm]),
+        jnp.stack([radius, radius, radius, palm, (0.7 + 0.2 * uniform[5]) * palm]),
     )
 
 

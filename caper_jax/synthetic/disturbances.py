@@ -15,7 +15,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from caper_jax.articulation.category import Viewpoint
 from caper_jax.synthetic import masks
-from caper_jax.synthetic.capsules import cable_capsules, capsule_depth, hand_capsules
+from caper_jax.synthetic.capsules import (
+    cable_capsules,
+    capsule_depth,
+    hand_capsules,
+    hand_scale,
+)
 from caper_jax.synthetic.instances import InstanceBank
 from caper_jax.synthetic.ray_casting import FAR
 
@@ -147,12 +152,38 @@ def add_hand(
 
     The mask takes in what is nearest to the touch, 10 to 60 % as many pixels as of the object.
     """
-    uniform = jax.random.uniform(key, (12,))
+    uniform = jax.random.uniform(key, (15,))
     place = masks.random_pixel(uniform[0], scene.hit)
     touch = scene.depth[place] * jnp.stack([rays[0][place], rays[1][place], jnp.ones(())])
-    surface = capsule_depth(hand_capsules(uniform[4:], touch, center, diagonal), rays)
+    scale = hand_scale(diagonal)
+    along = _hand_direction(uniform[4:9], scene, touch, center, scale, rays)
+    surface = capsule_depth(hand_capsules(uniform[9:], touch, along, scale), rays)
     share = jnp.where(uniform[1] < 0.5, 0.1 + 0.5 * uniform[2], 0.0)
     return _cover(scene, surface, place, share, uniform[3] < rate)
+
+
+def _hand_direction(uniform, scene: Scene, touch, center, scale, rays):
+    """Unit vector [3] that leads outward in the image, and up from the object's surface.
+
+    Of four drawn directions it is the one from which the hand comes in least steeply.
+    """
+    outward = touch[:2] / touch[2] - center[:2] / center[2]
+    outward = jnp.arctan2(outward[1], outward[0])
+    x, y = rays[0] * scene.depth - touch[0], rays[1] * scene.depth - touch[1]
+
+    def steepness(angle):
+        progress = jnp.cos(angle) * x + jnp.sin(angle) * y
+        aside = jnp.abs(jnp.cos(angle) * y - jnp.sin(angle) * x)
+        below = (scene.part >= 0) & (progress > 0.03 * scale) & (aside < 0.04 * scale)
+        slope = (touch[2] - scene.depth) / jnp.maximum(progress, 1e-6)
+        return jnp.where(below, slope, 0.0).max()
+
+    angles = outward + jnp.pi * (uniform[1:] - 0.5)
+    slopes = jnp.stack([steepness(angle) for angle in angles])
+    best = slopes.argmin()
+    slope = jnp.clip(0.3 + slopes[best], 0.1 + 0.9 * uniform[0], 2.0)
+    along = jnp.stack([jnp.cos(angles[best]), jnp.sin(angles[best]), -slope])
+    return along / jnp.linalg.norm(along)
 
 
 def add_cable(
