@@ -363,7 +363,9 @@ def test_few_points_are_repeated_evenly():
     # Points of no part are half of all: no part has 60 % unless it was chosen.
     chosen = np.array(most) > 0.6
     assert 0.35 < chosen.mean() < 0.65
-    assert np.array(most)[chosen].min() > 0.68 and np.array(most)[chosen].max() < 0.97
+    shares = np.array(most)[chosen]
+    # Labels that change from point to point make the share of 48 points inexact.
+    assert shares.min() > 0.62 and abs(shares.mean() - 0.825) < 0.02
     # Log-uniform where nothing else bounds the number.
     spread = np.log(distinct[few][~chosen] / 48) / np.log(count / 48)
     np.testing.assert_allclose(np.quantile(spread, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.1)
