@@ -179,7 +179,7 @@ def _hand_direction(uniform, scene: Scene, touch, center, scale, rays):
         return jnp.where(below, slope, 0.0).max()
 
     angles = outward + jnp.pi * (uniform[1:] - 0.5)
-    slopes = jnp.stack([steepness(angle) for angle in angles])
+    slopes = jax.vmap(steepness)(angles)
     best = slopes.argmin()
     slope = jnp.clip(0.3 + slopes[best], 0.1 + 0.9 * uniform[0], 2.0)
     along = jnp.stack([jnp.cos(angles[best]), jnp.sin(angles[best]), -slope])

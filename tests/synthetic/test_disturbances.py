@@ -444,10 +444,19 @@ def test_rim_points_lie_on_the_table_or_a_wall():
         assert spread[1] < 1e-3 * diagonal * np.sqrt(wall.sum())
 
 
+# A chain, two sides, holes to look through.
+RUN = ("robotarm", "scissors", "eyeglasses")
+
+
 @pytest.mark.parametrize("name", categories.names())
 def test_every_category_has_frames_with_all_of_it(name):
     config = GeneratorConfig(instances=3, grid=32, num_points=128, **RATES)
     generator = Generator(categories.get(name), config)
+    if name not in RUN:  # compiling all would take a minute
+        draw = partial(generator.draw, batch_size=4)
+        batch = jax.eval_shape(draw, jax.random.key(0), bank=generator.bank)
+        assert batch.points.shape == (4, 128, 3) and batch.labels.shape == (4, 128)
+        return
     batch = jax.tree.map(np.asarray, generator.batch(jax.random.key(0), 4))
     assert batch.points.shape == (4, 128, 3) and np.isfinite(batch.points).all()
     assert (batch.points[..., 2] > 0).all()
