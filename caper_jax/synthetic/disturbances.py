@@ -163,22 +163,23 @@ def add_hand(
 
 
 def _hand_direction(uniform, scene: Scene, touch, center, scale, rays):
-    """Unit vector [3] that leads outward in the image, and up from the object's surface.
+    """Unit vector [3] that leads outward in the image, and up from the object and the table.
 
     Of four drawn directions it is the one from which the hand comes in least steeply.
     """
     outward = touch[:2] / touch[2] - center[:2] / center[2]
     outward = jnp.arctan2(outward[1], outward[0])
-    x, y = rays[0] * scene.depth - touch[0], rays[1] * scene.depth - touch[1]
+    seen = jnp.minimum(scene.depth, scene.behind)
+    x, y = rays[0] * seen - touch[0], rays[1] * seen - touch[1]
 
     def steepness(angle):
         progress = jnp.cos(angle) * x + jnp.sin(angle) * y
         aside = jnp.abs(jnp.cos(angle) * y - jnp.sin(angle) * x)
-        below = (scene.part >= 0) & (progress > 0.03 * scale) & (aside < 0.04 * scale)
-        slope = (touch[2] - scene.depth) / jnp.maximum(progress, 1e-6)
+        below = (progress > 0.03 * scale) & (aside < 0.04 * scale)
+        slope = (touch[2] - seen) / jnp.maximum(progress, 1e-6)
         return jnp.where(below, slope, 0.0).max()
 
-    angles = outward + jnp.pi * (uniform[1:] - 0.5)
+    angles = outward + 1.6 * jnp.pi * (uniform[1:] - 0.5)
     slopes = jax.vmap(steepness)(angles)
     best = slopes.argmin()
     slope = jnp.clip(0.3 + slopes[best], 0.1 + 0.9 * uniform[0], 2.0)
@@ -272,9 +273,8 @@ def add_speckle(
     signed = 2 * uniform[count:-1] - 1
     push = -jnp.sign(signed) * jnp.log1p(-jnp.abs(signed)) * 0.1 * diagonal
     factor = jnp.maximum(1.0 + push / jnp.linalg.norm(points, axis=-1), 0.2)
-    return jnp.where(chosen[:, None], points * factor[:, None], points), jnp.where(
-        chosen, -1, labels
-    )
+    moved = points * factor[:, None]
+    return jnp.where(chosen[:, None], moved, points), jnp.where(chosen, -1, labels)
 
 
 def add_specks(
