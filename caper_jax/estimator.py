@@ -21,9 +21,9 @@ from caper_jax.articulation.pose import Array, ArticulatedPose, joints_in_camera
 from caper_jax.config import NetworkConfig, from_dict
 from caper_jax.data.clouds import MIN_POINTS, are_sampled, sample_points
 from caper_jax.errors import CaperError
-from caper_jax.geometry.frames import rotate, view_rotation
 from caper_jax.models import uncertainty
 from caper_jax.models.files import CARD_FILE, flatten, read_model
+from caper_jax.models.observation import observe
 from caper_jax.models.parts import PartsNetwork
 from caper_jax.models.pipeline import articulated_pose, refinements, run_stages
 from caper_jax.models.refiner import BoxRefiner, num_features
@@ -103,13 +103,14 @@ def estimate(
         raise CaperError(f"points must be floats, in meters, got {points.dtype}")
     # Moments of points cancel in half precision, without any NaN.
     points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
-    view = view_rotation(points, category.viewpoint.camera_roll)
-    cloud = rotate(view, points) * category.unit
+    observed = observe(points, category)
+    cloud = observed.cloud
     outputs = run_stages(variables, cloud, category, network)
     refined = refinements(variables, outputs, cloud, category, network)[-1]
     labels = outputs.segmentation.argmax(-1).astype(jnp.int32)
+    labels = observed.selection.spread_labels(labels)
     prediction = Prediction(
-        pose=articulated_pose(refined, view, category),
+        pose=articulated_pose(refined, observed.view, category),
         points=points,
         labels=labels,
         confidence=outputs.confidence,
@@ -179,7 +180,8 @@ class Estimator:
           Prediction with the leading axes of ``points``.
 
         Raises:
-          CaperError: wrong shape or dtype, fewer than 16 usable points, or points in millimeters.
+          CaperError: wrong shape or dtype, fewer than 48 usable points that
+            differ, or points in millimeters.
         """
         if isinstance(points, jax.core.Tracer):
             _check_shape(points.shape)

@@ -12,7 +12,7 @@ import numpy as np
 
 from caper_jax.articulation.category import Category
 from caper_jax.config import TrackerConfig, from_dict, override
-from caper_jax.data.clouds import FARTHEST_M, MIN_POINTS, as_cloud, is_measured, sample_points
+from caper_jax.data.clouds import FARTHEST_M, MIN_POINTS, as_cloud, sample_points, shows_object
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load
 from caper_jax.tracking.state import Observation, TrackerState
@@ -92,8 +92,8 @@ class Tracker:
 
         Args:
           points: [N, 3] meters, camera frame, N may be 0; NaN, infinite and zero points and those
-            beyond 50 m are left out. Fewer than 16 usable points count as a frame that does not
-            show the object.
+            beyond 50 m are left out. Fewer than 48 usable points that differ count as a frame
+            that does not show the object.
           labels: [N] int parts, -1 where unknown; by default all are predicted.
 
         Raises:
@@ -105,7 +105,7 @@ class Tracker:
         if labels is not None:
             labels = self._checked_labels(labels, len(points))
         unknown = np.full(count, -1, np.int32)
-        if is_measured(points).sum() < MIN_POINTS:
+        if not shows_object(points):
             nothing = np.zeros((count, 3), np.float32)
             return Observation(nothing, np.asarray(False), unknown)
         cloud = sample_points(points, count)

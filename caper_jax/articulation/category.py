@@ -15,6 +15,7 @@ from caper_jax.errors import CaperError, unknown_name
 from caper_jax.geometry.solids import Solid
 
 JointType = Literal["revolute", "prismatic"]
+_BEYOND_LIMITS = 0.25  # of the range: objects open wider than those that training saw
 
 
 @dataclass(frozen=True)
@@ -155,6 +156,14 @@ class Category:
     def state_units(self) -> np.ndarray:
         """[K-1] network units per meter (prismatic joints), 1 (revolute ones)."""
         return np.array([self.unit if t == "prismatic" else 1.0 for t in self.joint_types])
+
+    @property
+    def state_bounds(self) -> np.ndarray:
+        """[K-1, 2] states that an estimate may have: the limits, and a quarter of their range
+        beyond each; radians or meters."""
+        limits = np.array([joint.limits for joint in self.joints], float).reshape(-1, 2)
+        margin = _BEYOND_LIMITS * (limits[:, 1] - limits[:, 0])
+        return limits + np.stack([-margin, margin], axis=-1)
 
     def scaled(self, factor: float) -> Category:
         """The category of objects that are ``factor`` times as large; same networks, same weights.

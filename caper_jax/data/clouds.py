@@ -14,11 +14,12 @@ from caper_jax.data.images import read_array
 from caper_jax.errors import CaperError
 from caper_jax.geometry.raster_order import raster_order
 
-MIN_POINTS = 16
+MIN_POINTS = 48  # different ones: with fewer, poses are off by tens of degrees
 # Lines per side over the object's box: the generator casts its rays on such a grid.
 GRID = 96
 # Beyond this depth (meters) a cloud is taken for one in millimeters.
 FARTHEST_M = 50.0
+_MIXING = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 _ABSURD = 1e6  # no coordinate in any unit: some cameras say "nothing" by the largest float
 # A mask from a box: error of a stereo camera, which grows with z^2: 2 mm at 0.7 m, as measured on a
 # table; how many times that something must stand over the plane; the rim, relative to the box, in
@@ -101,7 +102,7 @@ def cloud_from_depth(
 
     Raises:
       CaperError: images of different size, an empty mask, no valid depth under it, or fewer than
-        16 usable points.
+        48 usable points.
     """
     depth, mask = np.asarray(depth), np.asarray(mask)
     if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.floating):
@@ -215,8 +216,8 @@ def sample_points(
       The cloud; ``index`` counts rows of ``points``.
 
     Raises:
-      CaperError: wrong shape or dtype, millimeters, points behind the camera, or fewer than 16
-        usable points.
+      CaperError: wrong shape or dtype, millimeters, points behind the camera, or fewer than 48
+        usable points that differ.
     """
     cast = as_cloud(points, where)
     kept = np.flatnonzero(is_measured(cast))
@@ -238,12 +239,42 @@ def sample_points(
         kept = kept[_near(cast[kept], radius)]
         _check_count(len(kept), f"of {len(points)} points in {where}")
     index = kept[_even_pick(cast[kept], num_points, seed)]
+    distinct = int(count_distinct(cast[index][None])[0])
+    if distinct < min(MIN_POINTS, num_points):
+        raise CaperError(too_few_points(distinct, len(kept), where))
     return Cloud(
         points=cast[index],
         pixels=np.zeros((0, 2), np.int32),
         index=index,
         available=len(kept),
         dropped=len(points) - len(kept),
+    )
+
+
+def count_distinct(clouds: Float32[np.ndarray, "B N 3"]) -> Int64[np.ndarray, " B"]:
+    """How many different points each cloud has."""
+    words = np.ascontiguousarray(clouds + np.float32(0)).view(np.uint32).astype(np.uint64)
+    # One number per point, equal by chance once in 2^64: sorting rows takes ten times as long.
+    keys = np.sort((words * _MIXING).sum(-1, dtype=np.uint64), axis=-1)
+    return (keys[:, 1:] != keys[:, :-1]).sum(-1) + 1
+
+
+def shows_object(points: Float32[np.ndarray, "N 3"], least: int = MIN_POINTS) -> bool:
+    """Whether so many points are measured and differ, in a large cloud among a thousand of them."""
+    measured = points[is_measured(points)]
+    if len(measured) < least:
+        return False
+    some = measured[:: max(len(measured) // 1024, 1)]
+    return bool(count_distinct(some[None])[0] >= least)
+
+
+def too_few_points(distinct: int, count: int, where: str) -> str:
+    """What to say of a cloud with so few different ones among so many usable points."""
+    if distinct == 1 < count:
+        return f"all {count} usable points of {where} are the same point; that is no object"
+    return (
+        f"only {distinct} of {count} usable points in {where} differ; at least {MIN_POINTS} "
+        "different points of the object are needed"
     )
 
 
@@ -259,7 +290,9 @@ def are_sampled(clouds: np.ndarray, num_points: int) -> bool:
     if not is_measured(cast).all():
         return False
     depth = np.median(cast[..., 2], axis=1)
-    return bool((depth > 0).all() and (np.abs(cast) <= FARTHEST_M).all())
+    if not ((depth > 0).all() and (np.abs(cast) <= FARTHEST_M).all()):
+        return False
+    return bool((count_distinct(cast) >= min(MIN_POINTS, num_points)).all())
 
 
 def _near(points: np.ndarray, radius: float) -> np.ndarray:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.clouds import MIN_POINTS, sample_points
+from caper_jax.data.clouds import sample_points, shows_object
 from caper_jax.data.types import Dataset, Frame, pose_problems, pose_shapes
 from caper_jax.errors import CaperError
 from caper_jax.lie import se3
@@ -166,7 +166,7 @@ def mean_predictor(category: Category, mean_pose: Mapping[str, Any], source: str
 
 def cloud_of(frame: Frame, num_points: int) -> Float32[np.ndarray, "points 3"]:
     """[N, 3] points that a predictor sees; some cloud where the frame shows too little to use."""
-    if len(frame.points) < MIN_POINTS:
+    if not shows_object(np.asarray(frame.points, np.float32)):
         return np.linspace((-0.1, -0.1, 0.9), (0.1, 0.1, 1.1), num_points, dtype=np.float32)
     return sample_points(frame.points, num_points, where=frame.name).points
 
@@ -183,7 +183,7 @@ def _truth(frame: Frame, category: Category) -> ArticulatedPose:
 def _checked(pose: ArticulatedPose, frame: Frame, category: Category) -> ArticulatedPose:
     """The estimate, or NaN everywhere if it failed."""
     finite = all(np.isfinite(array).all() for array in jax.tree.leaves(pose))
-    if finite and len(frame.points) >= MIN_POINTS:
+    if finite and shows_object(np.asarray(frame.points, np.float32)):
         return pose
     shapes = pose_shapes(category.num_parts)
     return ArticulatedPose(**{key: np.full(shape, np.nan) for key, shape in shapes.items()})

@@ -18,7 +18,6 @@ from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.config import NetworkConfig
 from caper_jax.geometry.frames import canonicalize, multiply, rotate
-from caper_jax.geometry.raster_order import from_raster_order, raster_order, to_raster_order
 from caper_jax.geometry.two_axis_rotation import rotation_from_directions
 from caper_jax.lie import se3
 from caper_jax.lie.linalg import transpose
@@ -60,7 +59,7 @@ def run_stages(
 
     Args:
       variables: see ``estimator.estimate``.
-      cloud: viewing frame, network units; in any order.
+      cloud: viewing frame, network units, raster order (``observation.Observation.cloud``).
       category, network: static.
     """
 
@@ -69,8 +68,6 @@ def run_stages(
         return module.apply(own, cloud, train=False, space=space)
 
     unit = category.unit
-    order = raster_order(cloud)
-    cloud = to_raster_order(cloud, order)
     space = shared_neighborhoods(network, cloud)
     root = apply("root", RootNetwork(network), cloud)
     rotation, degenerate = rotation_from_directions(
@@ -105,7 +102,7 @@ def run_stages(
             size=jnp.maximum(mean_size + parts.size, SMALLEST_SIZE * mean_size),
             center=jnp.asarray(category.mean_center, cloud.dtype) * unit + parts.center,
         ),
-        segmentation=from_raster_order(parts.segmentation, order),
+        segmentation=parts.segmentation,
         confidence=root.confidence,
         degenerate=degenerate,
         evidence=uncertainty.evidence(root.confidence, moved, parts.segmentation),
@@ -150,7 +147,7 @@ def refiner_inputs(
 def articulated_pose(
     estimate: StageEstimate, view: Float[Array, "B 3 3"], category: Category
 ) -> ArticulatedPose:
-    """An estimate in the camera frame, in meters.
+    """An estimate in the camera frame, in meters; states stay within ``Category.state_bounds``.
 
     Args:
       estimate: viewing frame, network units.
@@ -160,6 +157,8 @@ def articulated_pose(
     unit, back = category.unit, transpose(view)
     state_units = jnp.asarray(category.state_units, estimate.state.dtype)
     pivot, state = estimate.pivot / unit, estimate.state / state_units
+    low, high = category.state_bounds.astype(state.dtype).T
+    state = jnp.clip(state, low, high)
     translation = rotate(back, estimate.root[:, None, :3, 3])[:, 0] / unit
     poses = forward_kinematics(
         se3.from_rt(multiply(back, estimate.root[:, :3, :3]), translation),

@@ -19,6 +19,7 @@ from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.geometry.frames import canonicalize
 from caper_jax.geometry.raster_order import from_raster_order, raster_order, to_raster_order
 from caper_jax.lie import linalg, se3, so3
+from caper_jax.models.observation import Selection, select
 from caper_jax.models.parts import PartsNetwork, increment_transform, vote
 from caper_jax.models.rotation_classes import NUM_CUBE_ROTATIONS, log_odds
 from caper_jax.tracking.registration import JointTree, part_poses
@@ -54,6 +55,16 @@ class PoseMeasurement:
     rotation_log_odds: Float[AnyArray, "24"]
 
 
+def without_strays(points, labels) -> tuple[Array, Array, Selection]:
+    """Points [N, 3] and labels [N] without those that lie alone, and which ones they are."""
+    selection = select(points[None])
+    return (
+        selection.pick(points[None])[0],
+        selection.pick(labels[None, :, None])[0, :, 0],
+        selection,
+    )
+
+
 def measure(
     variables, points, labels, reference, category: Category, network: NetworkConfig
 ) -> PoseMeasurement:
@@ -86,10 +97,12 @@ def measure(
         known=jnp.zeros(category.num_joints),
     )
     tree = JointTree(axis[0], pivot[0], category.joint_types, category.parents)
+    low, high = (category.state_bounds * category.state_units[:, None]).T
+    state = jnp.clip(output.state[0], low, high)
     measurement = PoseMeasurement(
         root=se3.compose(reference, increment),
-        joint_state=output.state[0],
-        parts=part_poses(tree, output.state[0]),
+        joint_state=state,
+        parts=part_poses(tree, state),
         labels=jnp.where(labels >= 0, labels, predicted),
         parameters=parameters,
         confidence=jnp.asarray(1.0, points.dtype),

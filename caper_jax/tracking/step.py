@@ -37,6 +37,7 @@ from caper_jax.tracking.measurement import (
     joints_from_poses,
     measure,
     update_parameters,
+    without_strays,
 )
 from caper_jax.tracking.registration import (
     JointTree,
@@ -60,7 +61,7 @@ class TrackResult:
 
     Attributes:
       pose: ArticulatedPose [K, ...], meters, camera frame.
-      labels: [N] int32 part of each point.
+      labels: [N] int32 part of each point, -1 for strays (``geometry.outliers``).
       energy: [] Eq 16, relative to the object's diagonal.
       keyframe: [] bool, whether this frame became the keyframe.
       estimator_queried: [] bool, whether the single-frame estimator ran.
@@ -139,8 +140,8 @@ def given_state(
     """
     poses = se3.from_rt(rotation, translation * category.unit)
     root, parts = poses[0], se3.compose(se3.inverse(poses[0]), poses)
-    points = frame.points * category.unit
-    found = measure(variables, points, frame.labels, root, category, network)
+    points, labels, _ = without_strays(frame.points * category.unit, frame.labels)
+    found = measure(variables, points, labels, root, category, network)
     states, parameters = joints_from_poses(parts, found.parameters, category)
     measurement = replace(found, root=root, parts=parts, joint_state=states, parameters=parameters)
     begin = initial_state(category, network, config)
@@ -201,13 +202,14 @@ def _track_step(
     # A frame without points runs through the same arithmetic, on points where the object was.
     stand_in = se3.act(state.root, key.points) + jnp.array([0.0, 0.0, 1e-3])
     points = jnp.where(frame.present, frame.points * category.unit, stand_in)
+    points, labels, selection = without_strays(points, frame.labels)
 
     predicted = (
         se3.compose(state.root, se3.exp(config.damping * state.root_velocity)),
         state.joint_state + config.damping * state.joint_velocity,
     )
     reference = predicted[0] if config.use_prediction else key.root
-    found = measure(variables, points, frame.labels, reference, category, network)
+    found = measure(variables, points, labels, reference, category, network)
     parameters = update_parameters(state.parameters, found.parameters)
     tree = JointTree(parameters.axis, parameters.pivot, category.joint_types, category.parents)
 
@@ -220,6 +222,7 @@ def _track_step(
         expected = _expectations(config.registration, predicted, (root, joints))
         root, joints, information = register(*against, start, expected, config.registration)
         root = suppress_jitter(state.root, root, information, config.registration.hold)
+    joints = _bounded(joints, key.joint_state, category)
     tracked = PoseMeasurement(
         root,
         joints,
@@ -256,7 +259,7 @@ def _track_step(
     correction = update_keyframe(
         variables,
         points,
-        frame.labels,
+        labels,
         tracked,
         residual,
         state,
@@ -326,12 +329,18 @@ def _track_step(
     after = tree_where(usable, after, held)
     return after, TrackResult(
         pose=_articulated_pose(after, category),
-        labels=measurement.labels,
+        labels=selection.spread_labels(measurement.labels[None])[0],
         energy=energy,
         keyframe=due & usable,
         estimator_queried=correction.estimator_queried & usable,
         lost=~usable | (is_inconsistent & ~replaced),
     )
+
+
+def _bounded(joints, begun, category: Category):
+    """Joint states [J] within ``Category.state_bounds``, or as far beyond as the keyframe's."""
+    low, high = (category.state_bounds * category.state_units[:, None]).T
+    return jnp.clip(joints, jnp.minimum(low, begun), jnp.maximum(high, begun))
 
 
 def _finite(tree):

@@ -22,9 +22,9 @@ from caper_jax.config import PRESETS, GeneratorConfig, NetworkConfig, RefinerCon
 from caper_jax.data.types import Batch
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load
-from caper_jax.geometry.frames import rotate, view_rotation
 from caper_jax.lie import se3
 from caper_jax.models.files import write_model
+from caper_jax.models.observation import observe
 from caper_jax.models.pipeline import (
     articulated_pose,
     refinements,
@@ -149,8 +149,8 @@ def add_refiner(
 def _measure(variables, batch: Batch, category: Category, network: NetworkConfig):
     """(features [B, F], RefinerOutput that would be right, whether to learn it [B]) of every
     estimate: before and after each iteration of the network's refiner."""
-    view = view_rotation(batch.points, category.viewpoint.camera_roll)
-    cloud = rotate(view, batch.points) * category.unit
+    observed = observe(batch.points, category)
+    cloud, view = observed.cloud, observed.view
     outputs = run_stages(variables, cloud, category, network)
     rows = []
     for estimate in refinements(variables, outputs, cloud, category, network):

@@ -1,0 +1,78 @@
+"""What the networks see of a cloud: without strays, turned to the viewing ray, in raster order."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Integer, Shaped
+
+from caper_jax.articulation.category import Category
+from caper_jax.geometry.frames import rotate, view_rotation
+from caper_jax.geometry.outliers import Inliers, find_inliers
+from caper_jax.geometry.raster_order import from_raster_order, raster_order, to_raster_order
+
+
+@flax.struct.dataclass
+class Selection:
+    """The points of a batch of clouds that belong to the object, in raster order.
+
+    Attributes:
+      order: raster order of the points as they came.
+      inliers: which of them, in that order.
+    """
+
+    order: Integer[Array, "B N"]
+    inliers: Inliers
+
+    @property
+    def kept(self) -> Bool[Array, "B N"]:
+        """Which of the points that came belong to the object."""
+        return from_raster_order(self.inliers.kept[..., None], self.order)[..., 0]
+
+    def pick(self, values: Shaped[Array, "B N C"]) -> Shaped[Array, "B N C"]:
+        """Rows of the selection, from rows for the points that came."""
+        return self.inliers.apply(to_raster_order(values, self.order))
+
+    def spread(self, values: Shaped[Array, "B N C"]) -> Shaped[Array, "B N C"]:
+        """Rows for the points that came, from rows of the selection."""
+        return from_raster_order(self.inliers.undo(values), self.order)
+
+    def spread_labels(self, labels: Integer[Array, "B N"]) -> Integer[Array, "B N"]:
+        """Labels of the points that came, from those of the selection; -1 for strays."""
+        return jnp.where(self.kept, self.spread(labels[..., None])[..., 0], -1)
+
+
+def select(points: Float[Array, "B N 3"]) -> Selection:
+    """Sorts a cloud and finds what lies alone (``geometry.outliers``)."""
+    order = raster_order(points)
+    return Selection(order, find_inliers(to_raster_order(points, order)))
+
+
+@flax.struct.dataclass
+class ObservedCloud:
+    """A batch of clouds as the networks take them.
+
+    Attributes:
+      cloud: viewing frame, network units (meters times ``Category.unit``), raster order; without
+        strays, in whose places others are repeated.
+      view: camera -> viewing frame, see ``geometry.frames.view_rotation``.
+      selection: which of the points that came these are.
+    """
+
+    cloud: Float[Array, "B N 3"]
+    view: Float[Array, "B 3 3"]
+    selection: Selection
+
+
+def observe(points: Float[Array, "B N 3"], category: Category) -> ObservedCloud:
+    """Leaves out strays, and turns the ray to the mean of the others into the optical axis.
+
+    Args:
+      points: camera frame, meters, in any order.
+      category: static.
+    """
+    roll = category.viewpoint.camera_roll
+    selection = select(rotate(view_rotation(points, roll), points))
+    kept = selection.pick(points)
+    view = view_rotation(kept, roll)
+    return ObservedCloud(rotate(view, kept) * category.unit, view, selection)
