@@ -26,6 +26,13 @@ from caper_jax.models.files import CARD_FILE, flatten, read_model
 from caper_jax.models.observation import observe
 from caper_jax.models.parts import PartsNetwork
 from caper_jax.models.pipeline import articulated_pose, refinements, run_stages
+from caper_jax.models.plausibility import (
+    PlausibilityClassifier,
+    box_fit,
+    judge,
+    widening,
+)
+from caper_jax.models.plausibility import num_features as num_fit_features
 from caper_jax.models.refiner import BoxRefiner, num_features
 from caper_jax.models.root import RootNetwork
 from caper_jax.models.uncertainty import Calibration
@@ -40,12 +47,22 @@ class Prediction:
         pivots are in the root's rest frame: see ``joints_in_camera``.
       points: what the networks were given, camera frame, meters: the input itself when it has as
         many points as they take, else points picked evenly from it.
-      labels: part of each of ``points``, int32.
+      labels: part of each of ``points``, int32; -1 for strays, which the networks did not see.
       confidence: of the root's two directions, in (0, 1) (Sec 5.1.1).
       degenerate: the two directions were parallel or zero, so that the rotation is arbitrary.
       points_per_part: how many of ``points`` show each part, int32; a part with fewer than
         ``uncertainty.HIDDEN_POINTS`` is hidden, and known through its joints alone.
-      evidence: what the standard deviations follow from, see ``uncertainty.evidence``.
+      plausible: whether this can be an object of the category, whole, alone and in meters; where it
+        is False, nothing else here should be believed.
+      reason: why not, int32, an index into ``plausibility.REASONS``; 0 where it is plausible.
+        ``cli.warnings.warning_of`` puts it into words.
+      plausibility: in (0, 1); below 0.5 lies one in a hundred right objects. None where the model
+        has no classifier: then cloud size and number of points alone decide.
+      size_ratio: size of the cloud over that usual in the category: 5 for depth in the wrong unit
+        of a fifth of a millimeter.
+      distinct_points: how many different points the object has, int32, strays left out.
+      evidence: what the standard deviations follow from, see ``uncertainty.evidence`` and
+        ``plausibility.BoxFit``.
       rotation_std, translation_std: standard deviations about and along each axis of the camera,
         radians and meters; the truth lies within 2.5 of them nine times in ten. None, as is the
         next, where the model is not calibrated. See ``uncertainty.pose_covariance``.
@@ -58,7 +75,12 @@ class Prediction:
     confidence: Float[Array, "*batch 2"]
     degenerate: Bool[Array, "*batch"]
     points_per_part: Int[Array, "*batch K"]
+    plausible: Bool[Array, "*batch"]
+    reason: Int[Array, "*batch"]
+    size_ratio: Float[Array, "*batch"]
+    distinct_points: Int[Array, "*batch"]
     evidence: Float[Array, "*batch K E"]
+    plausibility: Float[Array, "*batch"] = None
     rotation_std: Float[Array, "*batch K"] = None
     translation_std: Float[Array, "*batch K"] = None
     state_std: Float[Array, "*batch J"] = None
@@ -84,7 +106,8 @@ def estimate(
 
     Args:
       variables: {"params": {"root", "parts"}, "batch_stats": {...}} as trained; with
-        ``network.refiner.width`` also "refiner" among "params".
+        ``network.refiner.width`` also "refiner" among "params"; "plausibility" where it was
+        fitted.
       points: [B, N, 3] meters, camera frame, finite; half precision is computed with in float32.
       category: static.
       network: static.
@@ -109,6 +132,8 @@ def estimate(
     refined = refinements(variables, outputs, cloud, category, network)[-1]
     labels = outputs.segmentation.argmax(-1).astype(jnp.int32)
     labels = observed.selection.spread_labels(labels)
+    fit = box_fit(refined, outputs.segmentation, outputs.evidence, observed, category)
+    verdict = judge(fit, variables["params"].get("plausibility"))
     prediction = Prediction(
         pose=articulated_pose(refined, observed.view, category),
         points=points,
@@ -116,11 +141,20 @@ def estimate(
         confidence=outputs.confidence,
         degenerate=outputs.degenerate,
         points_per_part=uncertainty.points_per_part(labels, category.num_parts),
-        evidence=outputs.evidence,
+        plausible=verdict.plausible,
+        reason=verdict.reason,
+        size_ratio=verdict.size_ratio,
+        distinct_points=fit.distinct,
+        evidence=jnp.concatenate([outputs.evidence, fit.evidence], axis=-1),
+        plausibility=None if verdict.score is None else jax.nn.sigmoid(verdict.score),
     )
     if calibration is None:
         return prediction
-    rotation, translation, state = uncertainty.radii(calibration, outputs.evidence)
+    rotation, translation, state = uncertainty.radii(calibration, prediction.evidence)
+    if verdict.score is not None:
+        wider = widening(verdict.score)[:, None]
+        rotation, translation = jnp.minimum(rotation * wider, np.pi), translation * wider
+        state = state * wider
     state_units = jnp.asarray(category.state_units, state.dtype)
     return prediction.replace(  # type: ignore[attr-defined]
         rotation_std=rotation / uncertainty.RADIUS_3D,
@@ -309,6 +343,9 @@ def _check_variables(directory: Path, variables, category: Category, network: Ne
     if network.refiner.width:
         features = jax.ShapeDtypeStruct((2, num_features(parts)), jnp.float32)
         modules["refiner"] = BoxRefiner(network.refiner.width, parts), features, {}
+    if "plausibility" in variables.get("params", {}):
+        features = jax.ShapeDtypeStruct((2, num_fit_features(parts)), jnp.float32)
+        modules["plausibility"] = PlausibilityClassifier(), features, {}
     collections = ["params", "batch_stats"]
     try:
         # Without a key: drawing random weights takes longer to trace than the networks.

@@ -19,6 +19,9 @@ from caper_jax.files import write_atomically
 PyTree = Any
 WEIGHTS_FILE = "weights.npz"
 CARD_FILE = "model.json"
+# A file of its own: fitted anew more often than the networks are trained, and a hundredth as large.
+PLAUSIBILITY_FILE = "plausibility.npz"
+_PLAUSIBILITY = "params/plausibility/"
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ _HALF_TOLERANCE = 1e-3  # relative; float16 itself keeps 5e-4 where it is not su
 def write_model(directory: str | Path, variables: PyTree, card: dict[str, Any]) -> None:
     """Write ``weights.npz`` and ``model.json``; each file appears complete or not at all.
 
+    With a classifier of plausibility among the variables also ``plausibility.npz``.
+
     Leaves are stored as float16, or as float32 where the round trip through float16 loses more
     than 1e-3 relative (overflow, or values near zero such as the variances of batch norm): of any
     value of a vector, of the norm of a kernel.
@@ -71,11 +76,34 @@ def write_model(directory: str | Path, variables: PyTree, card: dict[str, Any]) 
     directory = Path(directory)
     arrays = {name: _compact(name, leaf) for name, leaf in flatten(variables).items()}
     text = _card_text(card)
+    fitted = {name: arrays.pop(name) for name in list(arrays) if name.startswith(_PLAUSIBILITY)}
+    directory.mkdir(parents=True, exist_ok=True)
+    (directory / PLAUSIBILITY_FILE).unlink(missing_ok=True)  # never beside other weights
+    write_atomically(directory / WEIGHTS_FILE, _packed(arrays))
+    if fitted:
+        write_atomically(directory / PLAUSIBILITY_FILE, _packed(fitted))
+    write_atomically(directory / CARD_FILE, text)
+
+
+def write_plausibility(directory: str | Path, params: PyTree) -> None:
+    """Writes the classifier of plausibility of a model, in place of an older one.
+
+    Args:
+      directory: of the model.
+      params: of ``plausibility.PlausibilityClassifier``.
+
+    Raises:
+      CaperError: a weight is not finite or not a float.
+    """
+    variables = {"params": {"plausibility": params}}
+    arrays = {name: _compact(name, leaf) for name, leaf in flatten(variables).items()}
+    write_atomically(Path(directory) / PLAUSIBILITY_FILE, _packed(arrays))
+
+
+def _packed(arrays: dict[str, np.ndarray]) -> bytes:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    directory.mkdir(parents=True, exist_ok=True)
-    write_atomically(directory / WEIGHTS_FILE, buffer.getvalue())
-    write_atomically(directory / CARD_FILE, text)
+    return buffer.getvalue()
 
 
 def write_card(directory: str | Path, card: dict[str, Any]) -> None:
@@ -108,7 +136,15 @@ def read_model(directory: str | Path) -> tuple[dict[str, Any], PyTree]:
         Python without lzma.
     """
     card = read_card(directory)
-    path = Path(directory) / WEIGHTS_FILE
+    arrays = _unpacked(Path(directory) / WEIGHTS_FILE)
+    fitted = Path(directory) / PLAUSIBILITY_FILE
+    if fitted.is_file():
+        arrays |= _unpacked(fitted)
+    return card, unflatten(arrays, str(directory))
+
+
+def _unpacked(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a file, as float32."""
     try:
         # From memory: np.load leaves the file open where it is damaged.
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
@@ -125,7 +161,7 @@ def read_model(directory: str | Path) -> tuple[dict[str, Any], PyTree]:
             raise CaperError(f"{path}: {name!r} is {array.dtype}, expected float16 or float32")
         if not np.isfinite(array).all():
             raise CaperError(f"{path}: {name!r} has values that are not finite")
-    return card, unflatten({name: a.astype(np.float32) for name, a in arrays.items()}, str(path))
+    return {name: array.astype(np.float32) for name, array in arrays.items()}
 
 
 def read_card(directory: str | Path) -> dict[str, Any]:

@@ -26,7 +26,9 @@ COVERAGE = 0.9
 # Radii that hold COVERAGE of a normal distribution of unit variance, in three and one dimensions.
 RADIUS_3D, RADIUS_1D = 2.500278, 1.644854
 HIDDEN_POINTS = 10  # a part that fewer points show is known through its joints alone
-EVIDENCE = 6
+EVIDENCE = 6  # of the networks
+FIT_EVIDENCE = 6  # of the boxes, see ``plausibility.BoxFit``
+ALL_EVIDENCE = EVIDENCE + FIT_EVIDENCE
 _FLOOR = 1e-3
 
 
@@ -35,7 +37,7 @@ class Calibration:
     """Coefficients of a category: log radius = evidence @ [..., :-1] + [..., -1].
 
     Attributes:
-      rotation: radians; one column more than the evidence has, E = EVIDENCE + 1.
+      rotation: radians; one column more than the evidence has, E = ALL_EVIDENCE + 1.
       translation: network units.
       state: radians or network units.
       low, high: range of the evidence it was fitted on, beyond which nothing changes.
@@ -121,11 +123,11 @@ def from_card(section: Mapping[str, Any], num_parts: int, source: str) -> Calibr
       CaperError: a value is missing, of another shape, or no finite number.
     """
     shapes = {
-        "rotation": (num_parts, EVIDENCE + 1),
-        "translation": (num_parts, EVIDENCE + 1),
-        "state": (num_parts - 1, EVIDENCE + 1),
-        "low": (EVIDENCE,),
-        "high": (EVIDENCE,),
+        "rotation": (num_parts, ALL_EVIDENCE + 1),
+        "translation": (num_parts, ALL_EVIDENCE + 1),
+        "state": (num_parts - 1, ALL_EVIDENCE + 1),
+        "low": (ALL_EVIDENCE,),
+        "high": (ALL_EVIDENCE,),
     }
     values = {}
     for name, shape in shapes.items():

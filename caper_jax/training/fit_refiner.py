@@ -33,7 +33,7 @@ from caper_jax.models.pipeline import (
 )
 from caper_jax.models.refiner import BoxRefiner, RefinerOutput
 from caper_jax.progress import progress
-from caper_jax.training.fit_uncertainty import mixed_frames, nearer_symmetry
+from caper_jax.training.fit_uncertainty import mixed_frames, nearer_symmetry, sensors_alone
 
 FRAMES = 40_000
 _SPLIT = "train"
@@ -96,7 +96,8 @@ def _regress(
     measure = jax.jit(partial(_measure, category=estimator.category, network=network))
     rows = []
     title = "estimating poses for the refiner"
-    for batch in mixed_frames(estimator, config, _SPLIT, frames, seed, title):
+    configs = (config, sensors_alone(config))
+    for batch in mixed_frames(estimator, configs, _SPLIT, frames, seed, title):
         rows += jax.device_get(measure(estimator.variables, batch))
     features, off, learn = (
         jax.tree.map(lambda *parts: np.concatenate(parts), *column)

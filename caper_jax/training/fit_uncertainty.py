@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -28,7 +28,7 @@ from caper_jax.training.objective import where_samples
 
 FRAMES = 4096
 SPLIT = "val"
-_BATCH = 32
+BATCH = 32
 _SMALLEST = 1e-5  # radians or units: below it an error has no logarithm worth fitting
 _ITERATIONS = 200
 
@@ -40,9 +40,10 @@ def calibrate(
 
     Args:
       estimator: the model.
-      config: what half of the frames look like; the others have the sensors' noise alone. Of
-        instances that training never saw, and of the cameras among its sensors: fitted on clean
-        depth as well, regions would be too small on what a camera gives.
+      config: what a third of the frames look like; another has the sensors' noise alone, and the
+        last what is worse than in training (``disturbed``). Of instances that training never saw,
+        and of the cameras among its sensors: fitted on clean depth as well, regions would be too
+        small on what a camera gives.
       frames: how many to fit on.
       seed: of shapes and frames.
 
@@ -53,9 +54,10 @@ def calibrate(
     cameras = tuple(name for name in config.noise if name in CAMERAS) or config.noise
     config = replace(config, noise=cameras)
     measure = jax.jit(partial(_measure, estimator=estimator))
+    configs = (config, sensors_alone(config), disturbed(config))
     rows = [
         jax.device_get(measure(estimator.variables, batch))
-        for batch in mixed_frames(estimator, config, SPLIT, frames, seed, "calibrating")
+        for batch in mixed_frames(estimator, configs, SPLIT, frames, seed, "calibrating")
     ]
     evidence, *errors = (np.concatenate(column)[:frames] for column in zip(*rows, strict=True))
     low, high = np.quantile(evidence, [0.01, 0.99], axis=(0, 1))
@@ -76,38 +78,73 @@ def calibrate(
 
 def check_frame_count(frames: int) -> None:
     """Raises CaperError where so many frames are too few to calibrate on."""
-    if frames < 10 * _BATCH:
-        raise CaperError(f"calibration needs {10 * _BATCH} frames or more, got {frames}")
+    if frames < 10 * BATCH:
+        raise CaperError(f"calibration needs {10 * BATCH} frames or more, got {frames}")
+
+
+def sensors_alone(config: GeneratorConfig) -> GeneratorConfig:
+    """Frames that suffer from the noise of the sensors and from nothing else."""
+    return GeneratorConfig(
+        instances=config.instances,
+        grid=config.grid,
+        num_points=config.num_points,
+        noise=config.noise,
+    )
+
+
+def disturbed(config: GeneratorConfig) -> GeneratorConfig:
+    """Frames of the same right objects that are worse than those of training: strays of all kinds,
+    masks too wide, things in front, and few points."""
+    return replace(
+        config,
+        specks=0.1,
+        speckle=0.1,
+        flying=0.2,
+        rim=0.2,
+        hand=0.1,
+        cable=0.1,
+        few_points=0.5,
+    )
 
 
 def mixed_frames(
-    estimator: Estimator, config: GeneratorConfig, split: str, frames: int, seed: int, title: str
+    estimator: Estimator,
+    configs: Sequence[GeneratorConfig],
+    split: str,
+    frames: int,
+    seed: int,
+    title: str,
 ) -> Iterator[Batch]:
-    """Batches of generated frames, by turns as ``config`` has them and with sensors' noise alone.
+    """Batches of generated frames of an estimator's category, by turns as each of ``configs`` has
+    them, with as many points as it takes.
 
     Args:
-      estimator: whose category and number of points they have.
-      config: noise, and all else that frames may suffer from.
+      estimator: whose category it is.
+      configs: what the frames suffer from.
       split: of the instances.
       frames: at least so many.
       seed: of shapes and frames.
       title: of the progress display.
     """
-    rough = replace(
-        config,
-        instances=min(config.instances, frames),
-        num_points=estimator.network.num_points,
-    )
-    clean = GeneratorConfig(
-        instances=rough.instances, grid=rough.grid, num_points=rough.num_points, noise=rough.noise
-    )
-    generators = [Generator(estimator.category, one, split, seed) for one in (rough, clean)]
+    generators = [
+        Generator(
+            estimator.category,
+            replace(
+                config,
+                instances=min(config.instances, frames),
+                num_points=estimator.network.num_points,
+            ),
+            split,
+            seed,
+        )
+        for config in configs
+    ]
     key = jax.random.key(seed)
     with progress(title, total=frames) as bar:
-        for start in range(0, frames, _BATCH):
-            generator = generators[start // _BATCH % 2]
-            yield generator.batch(jax.random.fold_in(key, start), _BATCH)
-            bar.update(min(_BATCH, frames - start))
+        for start in range(0, frames, BATCH):
+            generator = generators[start // BATCH % len(generators)]
+            yield generator.batch(jax.random.fold_in(key, start), BATCH)
+            bar.update(min(BATCH, frames - start))
 
 
 def quantile_regression(

@@ -1,0 +1,241 @@
+"""Whether an estimate can be believed: an object of the category, whole, alone and in meters.
+
+A network answers whatever it is shown. How large the cloud is, how the points lie on the boxes that
+were found, how sure the segmentation is and how far sizes and states are from what training showed
+tells a small classifier (``training.fit_plausibility``) right objects from wrong ones. Not in the
+paper.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from caper_jax.articulation.category import Category
+from caper_jax.articulation.kinematics import forward_kinematics
+from caper_jax.geometry.boxes import rest_diagonal
+from caper_jax.lie import linalg
+from caper_jax.models.layers import Dense, Weights
+from caper_jax.models.observation import ObservedCloud
+from caper_jax.models.refiner import StageEstimate
+
+# What ``Prediction.reason`` counts; the classifier's classes are those from PLAUSIBLE to PART.
+PLAUSIBLE, SIZE, OTHER, SEVERAL, PART, FEW_POINTS, TOO_LARGE, TOO_SMALL = range(8)
+REASONS = (
+    "",
+    "no object of this category has this size",
+    "this is another object, or a surface",
+    "this is more than one object",
+    "this is a part of the object only",
+    "the points are too few",
+    "the object is too large",
+    "the object is too small",
+)
+NUM_CLASSES = PART + 1
+DOUBTFUL_POINTS = 100  # fewer different points are no basis for an answer
+WIDTHS = (64, 32)  # of the classifier's hidden layers
+_STRIDE = 2  # every n-th point is looked at
+_NEAR = (0.02, 0.05)  # distances, in diagonals
+_FLOOR = 1e-3
+# Logarithms of the cloud's size over the category's that a model which was not fitted takes.
+_LOW, _USUAL, _HIGH = np.log([0.35, 1.0, 2.5]).tolist()
+_GROWTH = 5.0  # largest logarithm by which implausibility widens standard deviations
+
+
+@flax.struct.dataclass
+class BoxFit:
+    """How a cloud lies in the boxes of its estimate.
+
+    Attributes:
+      features: what the classifier is given, see ``num_features``.
+      evidence: what standard deviations follow from, besides ``uncertainty.evidence``: for each
+        part logarithms of its points' mean distance from its box's surface and of that outside the
+        box, over the diagonal; of all points' outside; of the share of strays; of the number of
+        different points over that of all, and its square.
+      log_size: logarithm of the cloud's size over the category's.
+      distinct: number of different points.
+    """
+
+    features: Float[Array, "B F"]
+    evidence: Float[Array, "B K 6"]
+    log_size: Float[Array, "B"]
+    distinct: Int[Array, "B"]
+
+
+@flax.struct.dataclass
+class Verdict:
+    """Whether an estimate can be believed.
+
+    Attributes:
+      plausible: whether it can.
+      reason: index into ``REASONS`` of why not, 0 where it can.
+      score: log odds of being right, over those at which one right estimate in a hundred is
+        called wrong; None without a classifier.
+      size_ratio: size of the cloud over that usual in the category.
+    """
+
+    plausible: Bool[Array, "B"]
+    reason: Int[Array, "B"]
+    score: Float[Array, "B"] | None
+    size_ratio: Float[Array, "B"]
+
+
+class PlausibilityClassifier(Weights, nn.Module):
+    """Features of a ``BoxFit`` -> logits of the classes."""
+
+    @nn.compact
+    def __call__(self, features: Float[Array, "B F"]) -> Float[Array, "B C"]:
+        shape = features.shape[-1:]
+        mean = self.param("mean", nn.initializers.zeros, shape)
+        scale = self.param("scale", nn.initializers.ones, shape)
+        # Read by ``judge``: the score that counts as zero, and (low, usual, high) of ``log_size``.
+        self.param("threshold", nn.initializers.zeros, ())
+        self.param("log_size", nn.initializers.zeros, (3,))
+        hidden = jnp.arcsinh((features - mean) * scale)  # logarithmic where nothing was seen
+        for width in WIDTHS:
+            hidden = nn.relu(Dense(width)(hidden))
+        return Dense(NUM_CLASSES, kernel_init=nn.initializers.zeros)(hidden)
+
+
+def num_features(num_parts: int) -> int:
+    """F of ``BoxFit.features``, for K parts."""
+    return 8 + 3 * len(_NEAR) + 2 + 3 + 5 + 13 * num_parts + (num_parts - 1) + 2
+
+
+def box_fit(
+    estimate: StageEstimate,
+    segmentation: Float[Array, "B N K"],
+    evidence: Float[Array, "B K E"],
+    observed: ObservedCloud,
+    category: Category,
+) -> BoxFit:
+    """Compares an estimate with its cloud and its category.
+
+    Args:
+      estimate: the final one; viewing frame, network units.
+      segmentation: logits for the points of ``observed.cloud``.
+      evidence: of the networks, see ``uncertainty.evidence``.
+      observed: the cloud.
+      category: static.
+    """
+    batch, number = observed.cloud.shape[:2]
+    cloud, share = observed.cloud[:, ::_STRIDE], jax.nn.softmax(segmentation[:, ::_STRIDE])
+    mean_size = jnp.asarray(category.mean_size, cloud.dtype) * category.unit
+    mean_center = jnp.asarray(category.mean_center, cloud.dtype) * category.unit
+    diagonal = rest_diagonal(mean_size, mean_center)
+
+    own, outside, surface = _distances(estimate, cloud, category)
+    of_own, of_any = (share * outside).sum(-1), outside.min(-1)
+    from_own, from_any = (share * surface).sum(-1), surface.min(-1)
+    spreads = []
+    for distance in (of_own, from_own, of_any, from_any):
+        spreads += [distance.mean(-1), jnp.sqrt(jnp.square(distance).mean(-1))]
+    shares = [
+        (distance > near * diagonal).mean(-1)
+        for near in _NEAR
+        for distance in (of_any, from_any, of_own)
+    ]
+
+    weight = share / (share.sum(1, keepdims=True) + 1.0)
+    inside = own / (estimate.size[:, None] / 2)
+    middle = (weight[..., None] * inside).sum(1)
+    spread = (weight[..., None] * jnp.square(inside - middle[:, None])).sum(1)
+
+    away = cloud - jnp.median(cloud[:, ::4], axis=1, keepdims=True)
+    radius = jnp.sort(linalg.norm(away[:, ::4]), axis=1)
+    last = radius.shape[1] - 1
+    radii = jnp.stack([radius[:, last // 2], radius[:, round(0.95 * last)]], -1)
+    along = (away[..., :, None] * estimate.root[:, None, :3, :3]).sum(-2)
+
+    inliers = observed.selection.inliers
+    strays = 1.0 - inliers.kept.mean(-1)
+    distinct = jnp.log(inliers.distinct / number)
+    low, high = (category.state_bounds * category.state_units[:, None]).T.astype(cloud.dtype)
+    features = (
+        jnp.log(jnp.stack(spreads, -1) / diagonal + _FLOOR),
+        jnp.stack(shares, -1),
+        jnp.log(radii / diagonal + _FLOOR),
+        jnp.log(jnp.sqrt(jnp.square(along).mean(1) + 1e-12) / diagonal + _FLOOR),
+        evidence[:, 0, :5],
+        evidence[:, :, 5],
+        jnp.log(estimate.size / mean_size),
+        (estimate.center - mean_center) / diagonal,
+        (estimate.state - low) / (high - low),
+        strays[:, None],
+        distinct[:, None],
+        middle,
+        0.5 * jnp.log(spread + 1e-6),
+    )
+    flat = jnp.concatenate([values.reshape(batch, -1) for values in features], -1)
+
+    count = share.sum(1) + 1.0
+    of_parts = [
+        jnp.log((share * distance).sum(1) / count / diagonal + _FLOOR)
+        for distance in (surface, outside)
+    ]
+    away_from_all = jnp.log(of_own.mean(-1) / diagonal + _FLOOR)
+    of_frame = [
+        jnp.broadcast_to(one[:, None], of_parts[0].shape)
+        for one in (away_from_all, jnp.log(strays + 0.002), distinct, jnp.square(distinct))
+    ]
+    return BoxFit(
+        features=flat,
+        evidence=jnp.stack([*of_parts, *of_frame], -1),
+        log_size=jnp.log(2.0 * radii[:, 1] / diagonal + 1e-6),
+        distinct=inliers.distinct,
+    )
+
+
+def _distances(estimate: StageEstimate, cloud: Float[Array, "B N 3"], category: Category):
+    """Points in each part's frame from its box's center [B, N, K, 3], and their distances [B, N, K]
+    outside the box and from its surface."""
+    parts = forward_kinematics(
+        estimate.root,
+        estimate.axis,
+        estimate.pivot,
+        estimate.state,
+        category.joint_types,
+        category.parents,
+    )
+    away = cloud[:, :, None] - parts[:, None, :, :3, 3]
+    own = (away[..., :, None] * parts[:, None, :, :3, :3]).sum(-2) - estimate.center[:, None]
+    over = jnp.abs(own) - estimate.size[:, None] / 2
+    outside = linalg.norm(jnp.maximum(over, 0.0))
+    return own, outside, outside - jnp.minimum(over.max(-1), 0.0)
+
+
+def judge(fit: BoxFit, params: dict[str, Any] | None) -> Verdict:
+    """Whether an estimate can be believed, and why not.
+
+    Args:
+      fit: of the estimate.
+      params: of the classifier; None for a model without one, whose verdict rests on the size of
+        the cloud and the number of points alone.
+    """
+    low, usual, high = (_LOW, _USUAL, _HIGH) if params is None else params["log_size"]
+    score = None
+    reason = jnp.full(fit.distinct.shape, PLAUSIBLE, jnp.int32)
+    if params is not None:
+        logits: Any = PlausibilityClassifier().apply({"params": params}, fit.features)
+        score = logits[:, 0] - jax.nn.logsumexp(logits[:, 1:], axis=-1) - params["threshold"]
+        likeliest = 1 + logits[:, 1:].argmax(-1).astype(jnp.int32)
+        reason = jnp.where(score < 0, likeliest, reason)
+    reason = jnp.where(fit.log_size > high, TOO_LARGE, reason)
+    reason = jnp.where(fit.log_size < low, TOO_SMALL, reason)
+    reason = jnp.where(fit.distinct < DOUBTFUL_POINTS, FEW_POINTS, reason)
+    if score is not None:
+        # What a rule finds is no less implausible than what the classifier finds.
+        beyond = jnp.maximum(fit.log_size - high, low - fit.log_size)
+        score = jnp.where(beyond > 0, jnp.minimum(score, -4.0 * beyond), score)
+    return Verdict(reason == PLAUSIBLE, reason, score, jnp.exp(fit.log_size - usual))
+
+
+def widening(score: Float[Array, "B"]) -> Float[Array, "B"]:
+    """By which factor implausibility widens standard deviations: 1 for what is plausible."""
+    return jnp.exp(jnp.clip(-score, 0.0, _GROWTH))
