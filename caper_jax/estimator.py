@@ -55,7 +55,7 @@ class Prediction:
       plausible: whether this can be an object of the category, whole, alone and in meters; where it
         is False, nothing else here should be believed.
       reason: why not, int32, an index into ``plausibility.REASONS``; 0 where it is plausible.
-        ``cli.warnings.warning_of`` puts it into words.
+        ``plausibility.warning`` puts it into words.
       plausibility: in (0, 1); below 0.5 lies one in a hundred right objects. None where the model
         has no classifier: then cloud size and number of points alone decide.
       size_ratio: size of the cloud over that usual in the category: 5 for depth in the wrong unit

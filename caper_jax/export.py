@@ -24,17 +24,18 @@ from caper_jax.data.clouds import FARTHEST_M, MIN_POINTS
 from caper_jax.errors import CaperError, unknown_name
 from caper_jax.estimator import Estimator, Prediction
 from caper_jax.files import write_atomically
+from caper_jax.models.plausibility import REASONS
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 MODEL_FILE, MANIFEST_FILE, RUNNER_FILE = "model.jax_export", "manifest.json", "run.py"
-FORMAT = 2  # of the manifest
+FORMAT = 3  # of the manifest
 ANY_BATCH = "batch"  # stands for the size in shapes that leave it open
 
 _SAMPLING = (
     f"leave out points that are NaN, exactly zero or beyond {FARTHEST_M:g} m, ask for "
-    f"{MIN_POINTS} or more of the remaining n, sort them into some 32 rows of the image, within a "
-    "row by columns, and take those at floor((i + 0.5) n / num_points), i = 0 .. num_points - 1; "
-    "the order of the points taken does not matter"
+    f"{MIN_POINTS} or more different ones of the remaining n, sort them into some 32 rows of the "
+    "image, within a row by columns, and take those at floor((i + 0.5) n / num_points), "
+    "i = 0 .. num_points - 1; the order of the points taken does not matter"
 )
 # Frames of the manifest; "" where a quantity has none.
 _CAMERA, _PART, _ROOT, _NONE = "camera", "part_rest", "root_rest", ""
@@ -58,7 +59,7 @@ _OUTPUTS = {
     "joint_axis_camera": ("1", _CAMERA, "[B, J, 3] unit vectors where the joints are now"),
     "joint_pivot_camera": ("meters", _CAMERA, "[B, J, 3] a point on that axis"),
     "joint_state": ("state", _NONE, "[B, J] from the rest pose"),
-    "labels": ("1", _NONE, "[B, num_points] part of each point"),
+    "labels": ("1", _NONE, "[B, num_points] part of each point; -1 for strays, left out"),
     "confidence": (
         "1",
         _NONE,
@@ -69,6 +70,16 @@ _OUTPUTS = {
         _NONE,
         "[B] whether the rotation is arbitrary, as those directions were parallel",
     ),
+    "plausible": (
+        "1",
+        _NONE,
+        "[B] whether this can be an object of the category, whole, alone and in meters; where it "
+        "is false, nothing else should be believed",
+    ),
+    "reason": ("1", _NONE, '[B] why it is not plausible: index into "reasons"'),
+    "plausibility": ("1", _NONE, "[B] in (0, 1); below 0.5 lies one in a hundred right objects"),
+    "size_ratio": ("1", _NONE, "[B] size of the cloud over that usual in the category"),
+    "distinct_points": ("1", _NONE, "[B] how many different points the object has"),
     "points_per_part": ("1", _NONE, "[B, K] how many of the points show each part"),
     "rotation_std": ("radians", _CAMERA, "[B, K] standard deviation about each axis"),
     "translation_std": ("meters", _CAMERA, "[B, K] standard deviation along each axis"),
@@ -168,6 +179,7 @@ def _manifest(estimator: Estimator, exported: export.Exported) -> dict[str, Any]
         "caper_jax": __version__,
         "jax": jax.__version__,
         "category": category.name,
+        "reasons": list(REASONS),
         "parts": _parts(category),
         "joints": _joints(category),
         "model": MODEL_FILE,

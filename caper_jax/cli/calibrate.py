@@ -18,17 +18,18 @@ EXAMPLES = (
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Fits what a model says about its own errors, and writes it into the model's card.
+    """Fits what a model says about its own errors, and whether an estimate is plausible at all.
 
-    These standard deviations (rotation_std, translation_std, state_std) are fitted on generated
-    frames of instances that training never shows. With --refiner the network that corrects the
+    Standard deviations (rotation_std, translation_std, state_std) and the classifier that tells
+    right objects from wrong ones are fitted on generated frames of instances that training never
+    shows. With --refiner the network that corrects the
     model's estimates by the sides of their boxes is fitted first. Training on generated frames
     does both at its end.
 
     Attributes:
       category: e.g. box, or FILE.py:NAME for one of your own
-      weights: model directory; its model.json is rewritten
-      frames: to calibrate on
+      weights: model directory; its model.json and plausibility.npz are rewritten
+      frames: to calibrate on; three times as many for the classifier
       refiner: fit the refiner first
       refiner_frames: to fit the refiner on
       seed: of shapes and frames
@@ -55,6 +56,7 @@ def run(options: Calibrate) -> int:
     from caper_jax.estimator import load
     from caper_jax.models.files import CARD_FILE, write_card
     from caper_jax.training import fit_refiner
+    from caper_jax.training.fit_plausibility import FRAMES_PER_CALIBRATED, add_plausibility
     from caper_jax.training.fit_uncertainty import calibrate, check_frame_count
 
     weights, category = options.weights, options.category
@@ -63,6 +65,9 @@ def run(options: Calibrate) -> int:
         fit_refiner.add_refiner(
             weights, category, TRAINING_DATA, frames=options.refiner_frames, seed=options.seed
         )
+    add_plausibility(
+        weights, category, TRAINING_DATA, FRAMES_PER_CALIBRATED * options.frames, options.seed
+    )
     estimator = load(category, weights)
     section = calibrate(estimator, TRAINING_DATA, options.frames, options.seed)
     write_card(weights, {**estimator.card, "calibration": section})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,6 +83,7 @@ def run(options: Estimate) -> int:
     from caper_jax.estimator import load
     from caper_jax.evaluation.records import estimate_record
     from caper_jax.files import write_atomically
+    from caper_jax.models import plausibility
     from caper_jax.visualization.scene import Scene, format_scene
 
     category = categories.get(options.category)
@@ -91,10 +93,16 @@ def run(options: Estimate) -> int:
     prediction = jax.tree.map(lambda array: np.asarray(array)[0], prediction)
     record = estimate_record(frame.name, prediction, category, cloud)
     shown = prediction.points, prediction.labels, prediction.pose
-    scene = Scene.of_frame(frame, category, *shown)
+    doubt = plausibility.warning(prediction, category)
+    scene = Scene.of_frame(frame, category, *shown, warning=doubt)
 
+    if doubt:
+        print(f"warning: {doubt}", file=sys.stderr)
     print(format_scene(scene))
     print(f"{cloud.available} points, {cloud.dropped} dropped")
+    strays = int((prediction.labels < 0).sum())
+    if strays:
+        print(f"{strays} of {len(prediction.labels)} points looked at lie alone, and were left out")
     print(_certainty(prediction, category), end="")
     if prediction.degenerate:
         print("the rotation is arbitrary: the two directions that give it are parallel")

@@ -132,6 +132,7 @@ def _write_worst(
 
     from caper_jax.evaluation.protocol import NUM_POINTS, cloud_of
     from caper_jax.lie import so3
+    from caper_jax.models import plausibility
     from caper_jax.visualization.picture import write_picture
     from caper_jax.visualization.scene import Scene
 
@@ -149,5 +150,6 @@ def _write_worst(
         print(f"  {off[index]:6.1f} deg  {frame.name}")
         prediction = estimator(cloud_of(frame, NUM_POINTS))
         shown = prediction.points, prediction.labels, prediction.pose
-        scenes.append(Scene.of_frame(frame, dataset.category, *shown))
+        doubt = plausibility.warning(prediction, dataset.category)
+        scenes.append(Scene.of_frame(frame, dataset.category, *shown, warning=doubt))
     write_picture(path, scenes)

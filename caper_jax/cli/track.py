@@ -251,7 +251,7 @@ def track_stream(tracker: Tracker, frames: Iterable[LiveFrame]) -> None:
     from caper_jax.evaluation.records import frame_record, json_line
 
     category = tracker.estimator.category
-    skipped, lost, seconds = 0, 0, []
+    skipped, lost, implausible, doubt, seconds = 0, 0, 0, None, []
     try:
         for frame in frames:
             began = time.perf_counter()
@@ -264,9 +264,14 @@ def track_stream(tracker: Tracker, frames: Iterable[LiveFrame]) -> None:
             print(json_line({**record, "skipped": frame.skipped}), flush=True)
             skipped += frame.skipped
             lost += record["lost"]
+            implausible += not record["plausible"]
+            if record["reason"] and result.reason != doubt:
+                print(f"warning: frame {frame.sequence}: {record['reason']}", file=sys.stderr)
+            doubt = int(result.reason)
     finally:
         speed = f", {1000 * np.median(seconds):.1f} ms per frame (median)" if seconds else ""
         print(
-            f"{len(seconds)} frames tracked, lost in {lost}; {skipped} skipped{speed}",
+            f"{len(seconds)} frames tracked, lost in {lost}, implausible in {implausible}; "
+            f"{skipped} skipped{speed}",
             file=sys.stderr,
         )

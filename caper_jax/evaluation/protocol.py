@@ -18,6 +18,7 @@ from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.clouds import sample_points, shows_object
 from caper_jax.data.types import Dataset, Frame, pose_problems, pose_shapes
 from caper_jax.errors import CaperError
+from caper_jax.estimator import Prediction
 from caper_jax.lie import se3
 from caper_jax.progress import progress
 
@@ -25,8 +26,9 @@ BATCH_SIZE = 16
 NUM_POINTS = 1024
 Tree = TypeVar("Tree")
 
-# Poses [B, K, ...] for B frames and their clouds [B, N, 3], meters.
-Predictor = Callable[[Sequence[Frame], np.ndarray], ArticulatedPose]
+# Poses [B, K, ...] for B frames and their clouds [B, N, 3], meters; or predictions, which also say
+# whether they are plausible.
+Predictor = Callable[[Sequence[Frame], np.ndarray], ArticulatedPose | Prediction]
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,8 @@ class Evaluation:
       estimate: arrays [F, K, ...]; NaN where ``failed``.
       truth: arrays [F, K, ...].
       failed: [F] bool: too few points, or an estimate that is not finite.
+      plausible: [F] bool: what the predictor says of its estimates, False where ``failed``; None
+        where it says nothing.
       visibility: [F, K] share of each part that nothing hides; NaN where the data do not say.
       seconds_per_frame: time of the predictor alone, after a first call that compiles.
     """
@@ -46,6 +50,7 @@ class Evaluation:
     estimate: ArticulatedPose
     truth: ArticulatedPose
     failed: Bool[np.ndarray, " frames"]
+    plausible: Bool[np.ndarray, " frames"] | None
     visibility: Float[np.ndarray, "frames parts"]
     seconds_per_frame: float
 
@@ -76,6 +81,7 @@ def evaluate(
     estimates: list[ArticulatedPose] = []
     truths: list[ArticulatedPose] = []
     visibility: list[np.ndarray] = []
+    verdicts: list[np.ndarray] = []
     unknown = np.full(dataset.category.num_parts, np.nan)
     seconds = 0.0
     with progress("evaluating", total=count) as bar:
@@ -86,8 +92,11 @@ def evaluate(
             if start == 0:
                 predictor(padded, clouds)  # compiles
             began = time.perf_counter()
-            batch = jax.tree.map(np.asarray, predictor(padded, clouds))
+            batch: Any = jax.tree.map(np.asarray, predictor(padded, clouds))
             seconds += time.perf_counter() - began
+            if not isinstance(batch, ArticulatedPose):
+                verdicts.append(batch.plausible[: len(frames)])
+                batch = batch.pose
             names += [frame.name for frame in frames]
             truths += [_truth(frame, dataset.category) for frame in frames]
             visibility += [unknown if f.visibility is None else f.visibility for f in frames]
@@ -96,12 +105,14 @@ def evaluate(
                 estimates.append(_checked(pose, frame, dataset.category))
             bar.update(len(frames))
     estimate, truth = stack(estimates), stack(truths)
+    failed = np.isnan(estimate.rotation).any((-1, -2, -3))
     batches = -(-count // batch_size)
     return Evaluation(
         names=names,
         estimate=estimate,
         truth=truth,
-        failed=np.isnan(estimate.rotation).any((-1, -2, -3)),
+        failed=failed,
+        plausible=np.concatenate(verdicts) & ~failed if verdicts else None,
         visibility=np.stack(visibility),
         seconds_per_frame=seconds / (batches * batch_size),
     )
@@ -110,8 +121,8 @@ def evaluate(
 def model_predictor(estimator: Callable[[np.ndarray], Any]) -> Predictor:
     """The estimates of a trained model (``caper_jax.estimator.load``)."""
 
-    def predict(frames: Sequence[Frame], points: np.ndarray) -> ArticulatedPose:
-        return estimator(points).pose
+    def predict(frames: Sequence[Frame], points: np.ndarray) -> ArticulatedPose | Prediction:
+        return estimator(points)
 
     return predict
 

@@ -26,8 +26,13 @@ A record is one object of one frame and complete in itself:
     limits [2]: range of the category's states, in that unit.
     state_std: standard deviation of the state; absent as above.
 
-``estimate`` adds confidence (of the root's two directions, 0 to 1) and points (of the cloud:
-available, dropped). ``track`` adds energy, keyframe, estimated, lost and milliseconds; the live
+  plausible: whether this can be an object of the category, whole, alone and in meters; reason: in
+    one line why not, or null; size_ratio: size of the cloud over that usual in the category;
+    distinct_points: how many different points the object has.
+
+``estimate`` adds confidence (of the root's two directions, 0 to 1), plausibility (0 to 1, absent
+where the model has no classifier) and points (of the cloud: available, dropped). ``track`` adds
+energy, keyframe, estimated, lost and milliseconds; the live
 stream also skipped, the frames left out before this one.
 """
 
@@ -150,6 +155,9 @@ def estimate_record(
     if prediction.state_std is not None:
         for j, joint in enumerate(record["joints"]):
             joint["state_std"] = float(prediction.state_std[j]) * _per_unit(category, j)
+    record |= _verdict(prediction, category)
+    if prediction.plausibility is not None:
+        record["plausibility"] = round(float(prediction.plausibility), 6)
     record["confidence"] = prediction.confidence.tolist()
     record["points"] = {"available": cloud.available, "dropped": cloud.dropped}
     return record
@@ -175,7 +183,20 @@ def frame_record(
         "keyframe": bool(result.keyframe),
         "estimated": bool(result.estimator_queried),
         "lost": bool(result.lost),
+        **_verdict(result, category),
         "milliseconds": round(1000 * seconds, 3),
+    }
+
+
+def _verdict(result: Prediction | TrackResult, category: Category) -> dict[str, Any]:
+    """Whether a result can be believed, and in one line why not."""
+    from caper_jax.models.plausibility import warning
+
+    return {
+        "plausible": bool(result.plausible),
+        "reason": warning(result, category) or None,
+        "size_ratio": round(float(result.size_ratio), 4),
+        "distinct_points": int(result.distinct_points),
     }
 
 

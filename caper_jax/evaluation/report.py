@@ -44,7 +44,9 @@ def summarize(
 ) -> dict[str, Any]:
     """The content of metrics.json: counts, and mean and median of every error.
 
-    Failed frames are in every mean and median, with the values that "failure_value" names.
+    "implausible" is the share of frames whose estimate the model itself does not believe, and
+    "plausible_only" holds the errors of the others; all others hold those of every frame. Failed
+    frames are in every mean and median, with the values that "failure_value" names.
     "by_opening" holds the errors of frames in which the object is closed, ajar or open, where the
     category knows such a thing, and, where the data say how much of each part is visible,
     "by_occlusion" those of the parts within each bin of paper Table 8. For a category with declared
@@ -60,7 +62,7 @@ def summarize(
     category = dataset.category
     arguments = (evaluation.estimate, evaluation.truth, category, evaluation.failed)
     errors = pose_errors(*arguments)
-    report = {
+    report: dict[str, Any] = {
         "category": category.name,
         "format": dataset.format,
         "split": dataset.split,
@@ -73,6 +75,10 @@ def summarize(
         "weights": weights,
         "failure_value": FAILURE_VALUES,
     }
+    if evaluation.plausible is not None:
+        report["implausible"] = float(1.0 - evaluation.plausible.mean())
+        if evaluation.plausible.any():
+            report["plausible_only"] = error_tables(_of(errors, evaluation.plausible), category)
     if category.closed:
         state = np.asarray(evaluation.truth.joint_state)
         report["by_opening"] = errors_by_opening(errors, state, category)
@@ -105,6 +111,11 @@ def error_tables(errors: PoseErrors, category: Category) -> dict[str, list[dict[
         for j, kind in enumerate(category.joint_types)
     ]
     return {"parts": parts, "joints": joints}
+
+
+def _of(errors: PoseErrors, frames: np.ndarray) -> PoseErrors:
+    """The errors of the chosen frames [F] bool."""
+    return PoseErrors(**{name: values[frames] for name, values in vars(errors).items()})
 
 
 def errors_by_occlusion(
@@ -187,12 +198,13 @@ def summary(values: Float[np.ndarray, " frames"]) -> dict[str, float | None]:
 def write_report(folder: str | Path, evaluation: Evaluation, report: dict[str, Any]) -> None:
     """Writes metrics.json and predictions.npz, each whole or not at all.
 
-    predictions.npz holds, for F frames in order, ``frame`` (names), ``failed`` [F] and the
-    estimates ``R`` [F, K, 3, 3], ``t`` [F, K, 3] (part to camera, meters), ``size``,
-    ``box_center`` [F, K, 3] (rest frame of the part, meters), ``joint_axis``, ``joint_pivot``
-    [F, J, 3] (rest frame of the root), ``joint_state`` [F, J] (radians or meters), NaN where
-    failed, and the ground truth under the same names with ``truth_`` before; ``visibility`` [F, K]
-    is NaN where unknown. Every error in metrics.json can be computed from it.
+    predictions.npz holds, for F frames in order, ``frame`` (names), ``failed`` [F], ``plausible``
+    [F] where the predictor says so, and the estimates ``R`` [F, K, 3, 3], ``t`` [F, K, 3] (part to
+    camera, meters), ``size``, ``box_center`` [F, K, 3] (rest frame of the part, meters),
+    ``joint_axis``, ``joint_pivot`` [F, J, 3] (rest frame of the root), ``joint_state`` [F, J]
+    (radians or meters), NaN where failed, and the ground truth under the same names with
+    ``truth_`` before; ``visibility`` [F, K] is NaN where unknown. Every error in metrics.json can
+    be computed from it.
 
     Args:
       folder: exists.
@@ -202,6 +214,7 @@ def write_report(folder: str | Path, evaluation: Evaluation, report: dict[str, A
     arrays: dict[str, np.ndarray] = {
         "frame": np.array(evaluation.names),
         "failed": evaluation.failed,
+        **({} if evaluation.plausible is None else {"plausible": evaluation.plausible}),
         "visibility": evaluation.visibility,
     }
     for prefix, pose in (("", evaluation.estimate), ("truth_", evaluation.truth)):
@@ -226,6 +239,8 @@ def format_report(report: dict[str, Any]) -> str:
         "",
         *format_tables(report),
     ]
+    if "implausible" in report:
+        lines += ["", *_format_plausible(report)]
     if "by_opening" in report:
         lines += ["", "by how far the most open joint is open, of its limits:"]
         lines += _format_bins(report["by_opening"], "opened")
@@ -237,6 +252,23 @@ def format_report(report: dict[str, Any]) -> str:
         lines += ["", f"up to symmetry ({'; '.join(symmetric['reasons'])}):"]
         lines += format_tables(symmetric)
     return "\n".join(lines)
+
+
+def _format_plausible(report: dict[str, Any]) -> list[str]:
+    """How many estimates the model does not believe, and errors with and without them."""
+    share = f"implausible, by the model's own word: {100 * report['implausible']:.1f} % of frames"
+    if "plausible_only" not in report or not report["implausible"]:
+        return [share]
+    rows = []
+    for part, other in zip(report["parts"], report["plausible_only"]["parts"], strict=True):
+        errors = [
+            format_error(one[key], factor, digits)
+            for key, factor, digits in (("rotation_deg", 1, 2), ("translation_m", 1000, 1))
+            for one in (part, other)
+        ]
+        rows.append([part["name"], *errors])
+    header = ["part", "rotation [deg]", "without", "translation [mm]", "without"]
+    return [f"{share}; errors with and without them:", *text_table(header, rows)]
 
 
 def format_tables(tables: dict[str, Any]) -> list[str]:

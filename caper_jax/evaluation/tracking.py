@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,10 +20,13 @@ from caper_jax.evaluation.metrics import PoseErrors, pose_errors
 from caper_jax.evaluation.protocol import stack
 from caper_jax.evaluation.records import frame_record
 from caper_jax.evaluation.report import error_tables, format_tables, text_table
+from caper_jax.models import plausibility
 from caper_jax.tracker import Tracker
 from caper_jax.tracking.step import TrackResult
 
 Start = Literal["truth", "estimator"]
+# Fields of a ``TrackResult`` that say whether it can be believed.
+_VERDICT = ("plausible", "reason", "size_ratio", "distinct_points")
 _NAME_WIDTH = 30  # of a video in a table
 
 
@@ -38,6 +42,7 @@ class Track:
       energy: [T] Eq 16, relative to the object's diagonal.
       keyframe, estimated, lost: [T] bool, see ``tracking.step.TrackResult``.
       labels: [T, N] part of every point that the tracker took of a frame.
+      plausible, reason, size_ratio, distinct_points: [T] likewise.
       seconds: [T] from points to pose, after a first call that compiles.
     """
 
@@ -49,6 +54,10 @@ class Track:
     keyframe: np.ndarray
     estimated: np.ndarray
     lost: np.ndarray
+    plausible: np.ndarray
+    reason: np.ndarray
+    size_ratio: np.ndarray
+    distinct_points: np.ndarray
     seconds: np.ndarray
     labels: np.ndarray | None = None
 
@@ -106,6 +115,7 @@ def track_video(
         keyframe=stacked.keyframe,
         estimated=stacked.estimator_queried,
         lost=stacked.lost,
+        **{name: getattr(stacked, name) for name in _VERDICT},
         seconds=np.array(seconds),
         labels=stacked.labels,
     )
@@ -151,7 +161,7 @@ def summarize_tracks(
     tables = joined_tables(errors, category)
     after = {
         key: np.concatenate([getattr(track, key)[1:] for track in tracks])
-        for key in ("keyframe", "estimated", "lost", "seconds")
+        for key in ("keyframe", "estimated", "lost", "plausible", "seconds")
     }
     return {
         "category": category.name,
@@ -164,6 +174,7 @@ def summarize_tracks(
         "keyframes": int(after["keyframe"].sum()),
         "estimated": int(after["estimated"].sum()),
         "lost": int(after["lost"].sum()),
+        "implausible": int((~after["plausible"]).sum()),
         "median_seconds_per_frame": float(np.median(after["seconds"])),
     }
 
@@ -175,15 +186,21 @@ def track_records(track: Track, category: Category) -> Iterator[dict[str, Any]]:
       CaperError: a pose that is not finite.
     """
     for index, frame in enumerate(track.frames):
-        result = TrackResult(
-            pose=jax.tree.map(lambda array, i=index: array[i], track.pose),
-            labels=None,
-            energy=track.energy[index],
-            keyframe=track.keyframe[index],
-            estimator_queried=track.estimated[index],
-            lost=track.lost[index],
-        )
-        yield frame_record(frame, result, category, float(track.seconds[index]))
+        seconds = float(track.seconds[index])
+        yield frame_record(frame, _result(track, index), category, seconds)
+
+
+def _result(track: Track, index: int) -> TrackResult:
+    """What the tracker said of one frame, without labels."""
+    return TrackResult(
+        pose=jax.tree.map(lambda array: array[index], track.pose),
+        labels=None,
+        energy=track.energy[index],
+        keyframe=track.keyframe[index],
+        estimator_queried=track.estimated[index],
+        lost=track.lost[index],
+        **{name: getattr(track, name)[index] for name in _VERDICT},
+    )
 
 
 def format_tracks(
@@ -224,6 +241,13 @@ def format_tracks(
         for track in tracks
     ]
     lines += text_table(header, rows)
+    for track in tracks:
+        if doubtful := int((~track.plausible).sum()):
+            first = int(np.argmin(track.plausible))
+            reason = plausibility.warning(_result(track, first), category)
+            count = _count(doubtful, "implausible frame")
+            text = f"{_shorten(track.name)}: {count}, the first is {track.frames[first]}: {reason}"
+            lines += textwrap.wrap(text, 80)
     if metrics is not None:
         lines += ["", "errors of all frames but the first of each video, mean / median:", ""]
         lines += format_tables(metrics)

@@ -8,7 +8,7 @@ paper.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import flax.linen as nn
 import flax.struct
@@ -147,10 +147,7 @@ def box_fit(
     middle = (weight[..., None] * inside).sum(1)
     spread = (weight[..., None] * jnp.square(inside - middle[:, None])).sum(1)
 
-    away = cloud - jnp.median(cloud[:, ::4], axis=1, keepdims=True)
-    radius = jnp.sort(linalg.norm(away[:, ::4]), axis=1)
-    last = radius.shape[1] - 1
-    radii = jnp.stack([radius[:, last // 2], radius[:, round(0.95 * last)]], -1)
+    away, radii = _radii(cloud)
     along = (away[..., :, None] * estimate.root[:, None, :3, :3]).sum(-2)
 
     inliers = observed.selection.inliers
@@ -187,9 +184,27 @@ def box_fit(
     return BoxFit(
         features=flat,
         evidence=jnp.stack([*of_parts, *of_frame], -1),
-        log_size=jnp.log(2.0 * radii[:, 1] / diagonal + 1e-6),
+        log_size=_log_size(radii, diagonal),
         distinct=inliers.distinct,
     )
+
+
+def log_size(cloud: Float[Array, "B N 3"], category: Category) -> Float[Array, "B"]:
+    """Logarithm of a cloud's size over its category's; network units, raster order, no strays."""
+    boxes = (jnp.asarray(size, cloud.dtype) for size in (category.mean_size, category.mean_center))
+    return _log_size(_radii(cloud[:, ::_STRIDE])[1], rest_diagonal(*boxes) * category.unit)
+
+
+def _log_size(radii, diagonal):
+    return jnp.log(2.0 * radii[:, 1] / diagonal + 1e-6)
+
+
+def _radii(cloud: Float[Array, "B N 3"]) -> tuple[Float[Array, "B N 3"], Float[Array, "B 2"]]:
+    """Points from the median point, and the distances that half and 95 % of them are within."""
+    away = cloud - jnp.median(cloud[:, ::4], axis=1, keepdims=True)
+    radius = jnp.sort(linalg.norm(away[:, ::4]), axis=1)
+    last = radius.shape[1] - 1
+    return away, jnp.stack([radius[:, last // 2], radius[:, round(0.95 * last)]], -1)
 
 
 def _distances(estimate: StageEstimate, cloud: Float[Array, "B N 3"], category: Category):
@@ -218,17 +233,15 @@ def judge(fit: BoxFit, params: dict[str, Any] | None) -> Verdict:
       params: of the classifier; None for a model without one, whose verdict rests on the size of
         the cloud and the number of points alone.
     """
-    low, usual, high = (_LOW, _USUAL, _HIGH) if params is None else params["log_size"]
-    score = None
     reason = jnp.full(fit.distinct.shape, PLAUSIBLE, jnp.int32)
+    score = None
     if params is not None:
         logits: Any = PlausibilityClassifier().apply({"params": params}, fit.features)
         score = logits[:, 0] - jax.nn.logsumexp(logits[:, 1:], axis=-1) - params["threshold"]
         likeliest = 1 + logits[:, 1:].argmax(-1).astype(jnp.int32)
         reason = jnp.where(score < 0, likeliest, reason)
-    reason = jnp.where(fit.log_size > high, TOO_LARGE, reason)
-    reason = jnp.where(fit.log_size < low, TOO_SMALL, reason)
-    reason = jnp.where(fit.distinct < DOUBTFUL_POINTS, FEW_POINTS, reason)
+    reason = rules(reason, fit.log_size, fit.distinct, params)
+    low, usual, high = size_bounds(params)
     if score is not None:
         # What a rule finds is no less implausible than what the classifier finds.
         beyond = jnp.maximum(fit.log_size - high, low - fit.log_size)
@@ -236,6 +249,66 @@ def judge(fit: BoxFit, params: dict[str, Any] | None) -> Verdict:
     return Verdict(reason == PLAUSIBLE, reason, score, jnp.exp(fit.log_size - usual))
 
 
+def size_bounds(params: dict[str, Any] | None) -> Any:
+    """Smallest, usual and largest ``log_size`` of the category's objects."""
+    return (_LOW, _USUAL, _HIGH) if params is None else params["log_size"]
+
+
+def rules(reason, log_size, distinct, params: dict[str, Any] | None):
+    """The reason of a verdict, where size or number of points alone do not decide it."""
+    low, _, high = size_bounds(params)
+    reason = jnp.where(log_size > high, TOO_LARGE, reason)
+    reason = jnp.where(log_size < low, TOO_SMALL, reason)
+    return jnp.where(distinct < DOUBTFUL_POINTS, FEW_POINTS, reason)
+
+
 def widening(score: Float[Array, "B"]) -> Float[Array, "B"]:
     """By which factor implausibility widens standard deviations: 1 for what is plausible."""
     return jnp.exp(jnp.clip(-score, 0.0, _GROWTH))
+
+
+class Judged(Protocol):
+    """What ``warning`` reads of a prediction or of a result of the tracker."""
+
+    reason: Any
+    size_ratio: Any
+    distinct_points: Any
+
+
+def warning(result: Judged, category: Category) -> str:
+    """One line on why a result is not plausible, with the likely cause; "" where it is.
+
+    Args:
+      result: a ``Prediction`` or a ``TrackResult``, without batch axes.
+      category: what it was taken for.
+    """
+    reason, ratio = int(result.reason), float(result.size_ratio)
+    name = category.name
+    if reason == PLAUSIBLE:
+        return ""
+    if reason == FEW_POINTS:
+        return (
+            f"only {int(result.distinct_points)} different points show the object; an answer needs "
+            f"{DOUBTFUL_POINTS}"
+        )
+    if reason in (TOO_LARGE, TOO_SMALL) or (reason == SIZE and not 0.6 < ratio < 1.7):
+        larger = ratio > 1.0
+        times = f"{ratio if larger else 1 / ratio:.1f} times too {'large' if larger else 'small'}"
+        return f"the object looks {times} for this category ({name}): {_cause(ratio)}"
+    return {
+        SIZE: f"no object of this category ({name}) has this size and shape",
+        OTHER: f"this does not look like this category ({name}); is it another object?",
+        SEVERAL: "the cloud shows more than one object; does the mask take in something else?",
+        PART: f"the cloud shows only a part of the object ({name}), or another object",
+    }[reason]
+
+
+def _cause(ratio: float) -> str:
+    """Why a cloud may be so many times as large as it should be."""
+    if 3.5 < ratio < 7.0:
+        return "images of the TUM kind have 5000 units per meter (--depth-scale 0.0002)"
+    if 7.0 <= ratio < 14.0 or 0.07 < ratio <= 0.14:
+        return "is the depth in tenths of a millimeter (--depth-scale 0.0001), as in some BOP data?"
+    if ratio > 100 or ratio < 0.01:
+        return "points must be meters"
+    return "check the unit of the depth (--depth-scale), or say so (--object-scale)"

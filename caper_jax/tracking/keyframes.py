@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -122,6 +124,7 @@ def update_keyframe(
         lambda: estimate_measurement(variables, points, labels, category, network),
         lambda: tracked,
     )
+    reason = static.reason  # before stage II, which has none, takes the estimate's place
     accepted = queried & (
         (static.confidence >= config.min_confidence) | (num_inconsistent >= config.patience + _LONG)
     )
@@ -164,8 +167,9 @@ def update_keyframe(
         parameters=tracked.parameters,
         confidence=tracked.confidence,
         rotation_log_odds=tracked.rotation_log_odds,
+        reason=jnp.where(queried, reason, tracked.reason),
     )
-    measurement = tree_where(replaced, static, fused)
+    measurement = replace(tree_where(replaced, static, fused), reason=fused.reason)
     # (1 - gain) grown, which would cancel where the gain is nearly one.
     left = jnp.where(gain > 0, gain * static_variance, grown)
     variance = jnp.where(replaced, static_variance, left)

@@ -21,6 +21,7 @@ from caper_jax.geometry.raster_order import from_raster_order, raster_order, to_
 from caper_jax.lie import linalg, se3, so3
 from caper_jax.models.observation import Selection, select
 from caper_jax.models.parts import PartsNetwork, increment_transform, vote
+from caper_jax.models.plausibility import PLAUSIBLE
 from caper_jax.models.rotation_classes import NUM_CUBE_ROTATIONS, log_odds
 from caper_jax.tracking.registration import JointTree, part_poses
 from caper_jax.tracking.state import ObjectParameters, of_type
@@ -44,6 +45,7 @@ class PoseMeasurement:
       confidence: [] in [0, 1], the lower one of the root's two directions (Eq 18); 1 of a track.
       rotation_log_odds: [24] log odds that the reference is off by each rotation of
         ``models.rotation_classes``; zero without evidence.
+      reason: [] int32, why the pose is not plausible, see ``plausibility.REASONS``.
     """
 
     root: Float[Array, "4 4"]
@@ -53,6 +55,7 @@ class PoseMeasurement:
     parameters: ObjectParameters
     confidence: Float[Array, ""]
     rotation_log_odds: Float[AnyArray, "24"]
+    reason: Int[AnyArray, ""]
 
 
 def without_strays(points, labels) -> tuple[Array, Array, Selection]:
@@ -69,6 +72,8 @@ def measure(
     variables, points, labels, reference, category: Category, network: NetworkConfig
 ) -> PoseMeasurement:
     """Stage II on the proxy-canonicalized cloud (Eq 9): increment from the reference, and the rest.
+
+    Stage II alone cannot tell whether the object is plausible: the pose is said to be.
 
     Args:
       variables: as ``estimator.estimate`` takes them.
@@ -109,6 +114,7 @@ def measure(
         rotation_log_odds=(
             _NO_ROTATION if output.rotation_class is None else log_odds(output.rotation_class[0])
         ),
+        reason=jnp.asarray(PLAUSIBLE, jnp.int32),
     )
     return of_type(measurement, points.dtype)
 
@@ -136,6 +142,7 @@ def estimate_measurement(
         ),
         confidence=prediction.confidence[0].min(),
         rotation_log_odds=_NO_ROTATION,
+        reason=prediction.reason[0],
     )
     return of_type(measurement, points.dtype)
 

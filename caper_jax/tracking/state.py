@@ -89,6 +89,7 @@ class TrackerState:
       rotation_votes: [24] likewise, according to the estimates of the first frames.
       init_frames_left: [] int32, in how many further frames the estimator is queried.
       lost: [] bool, the next frame with points starts from the estimator alone.
+      reason: [] int32, why the last estimate was not plausible, see ``plausibility.REASONS``.
     """
 
     root: Float[Array, "4 4"]
@@ -106,6 +107,7 @@ class TrackerState:
     rotation_votes: Float[Array, "24"]
     init_frames_left: Int[Array, ""]
     lost: Bool[Array, ""]
+    reason: Int[Array, ""]
 
 
 def of_type(tree, dtype):

@@ -17,6 +17,7 @@ from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.config import NetworkConfig, RegistrationConfig, TrackerConfig
 from caper_jax.lie import se3
 from caper_jax.models.pipeline import SMALLEST_SIZE
+from caper_jax.models.plausibility import FEW_POINTS, PLAUSIBLE, log_size, rules, size_bounds
 from caper_jax.models.rotation_classes import NUM_CUBE_ROTATIONS
 from caper_jax.tracking.keyframes import (
     add_log_odds,
@@ -67,6 +68,11 @@ class TrackResult:
       estimator_queried: [] bool, whether the single-frame estimator ran.
       lost: [] bool, the pose is not to be trusted: it is held from before, as the frame does not
         show the object or holds impossible numbers; or it is inconsistent with the frame.
+      plausible: [] bool, whether this can be an object of the category, by this frame's size and
+        number of points and by the last estimate of the single-frame estimator.
+      reason: [] int32, why not, an index into ``plausibility.REASONS``.
+      size_ratio: [] size of the cloud over that usual in the category.
+      distinct_points: [] int32, how many different points the object has, strays left out.
     """
 
     pose: ArticulatedPose
@@ -75,6 +81,10 @@ class TrackResult:
     keyframe: Bool[AnyArray, "*frames"]
     estimator_queried: Bool[AnyArray, "*frames"]
     lost: Bool[AnyArray, "*frames"]
+    plausible: Bool[AnyArray, "*frames"]
+    reason: Int[AnyArray, "*frames"]
+    size_ratio: Float[AnyArray, "*frames"]
+    distinct_points: Int[AnyArray, "*frames"]
 
 
 def initial_state(category: Category, network: NetworkConfig, config: TrackerConfig):
@@ -113,6 +123,7 @@ def initial_state(category: Category, network: NetworkConfig, config: TrackerCon
         rotation_votes=jnp.zeros(NUM_CUBE_ROTATIONS),
         init_frames_left=jnp.asarray(0, jnp.int32),
         lost=jnp.asarray(True),
+        reason=jnp.asarray(PLAUSIBLE, jnp.int32),
     )
     return of_type(state, eye.dtype)
 
@@ -231,6 +242,7 @@ def _track_step(
         parameters,
         found.confidence,
         found.rotation_log_odds,
+        state.reason,
     )
     # Frames show the same object from nearly the same side, so that each counts for little.
     log_odds = add_log_odds(
@@ -318,6 +330,7 @@ def _track_step(
         rotation_votes=jnp.where(replaced, 0.0, correction.rotation_votes),
         init_frames_left=jnp.where(replaced, config.init_frames, left).astype(jnp.int32),
         lost=jnp.asarray(False),
+        reason=measurement.reason,
     )
     held = replace(
         state,
@@ -327,6 +340,11 @@ def _track_step(
     # Numbers that overflowed on the way would stay for good.
     usable = frame.present & _finite(after)
     after = tree_where(usable, after, held)
+    distinct = selection.inliers.distinct
+    size = log_size(points[None], category)
+    classifier = variables["params"].get("plausibility")
+    reason = rules(measurement.reason[None], size, distinct, classifier)[0]
+    reason = jnp.where(frame.present, reason, FEW_POINTS).astype(jnp.int32)
     return after, TrackResult(
         pose=_articulated_pose(after, category),
         labels=selection.spread_labels(measurement.labels[None])[0],
@@ -334,6 +352,10 @@ def _track_step(
         keyframe=due & usable,
         estimator_queried=correction.estimator_queried & usable,
         lost=~usable | (is_inconsistent & ~replaced),
+        plausible=reason == PLAUSIBLE,
+        reason=reason,
+        size_ratio=jnp.exp(size[0] - size_bounds(classifier)[1]),
+        distinct_points=jnp.where(frame.present, distinct[0], 0),
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,10 +20,13 @@ import optax
 from jaxtyping import Float
 
 from caper_jax import categories
+from caper_jax.articulation.category import Category
 from caper_jax.config import GeneratorConfig
 from caper_jax.data.clouds import MIN_POINTS, systematic_indices
-from caper_jax.estimator import Estimator
+from caper_jax.errors import CaperError
+from caper_jax.estimator import Estimator, load
 from caper_jax.geometry.boxes import rest_diagonal
+from caper_jax.models.files import write_card, write_plausibility
 from caper_jax.models.observation import observe
 from caper_jax.models.pipeline import refinements, run_stages
 from caper_jax.models.plausibility import (
@@ -45,6 +49,8 @@ from caper_jax.training.fit_uncertainty import (
 )
 
 FRAMES = 12_288  # of right objects, and about as many wrong ones
+FRAMES_PER_CALIBRATED = 3  # of those that standard deviations are fitted on
+_FEWEST = 12 * BATCH
 FALSE_ALARMS = 0.01  # of right objects that are called wrong
 _OTHER_SIZES = ((0.08, 0.5), (2.0, 12.0))
 _STEPS = 8000
@@ -112,6 +118,40 @@ def fit_plausibility(
     threshold = np.quantile(np.asarray(score), FALSE_ALARMS)
     found = {"threshold": np.float32(threshold), "log_size": np.asarray(bounds, np.float32)}
     return {**jax.device_get(params), **found}
+
+
+def add_plausibility(
+    directory: str | Path,
+    category: str | Category,
+    config: GeneratorConfig,
+    frames: int = FRAMES,
+    seed: int = 0,
+) -> None:
+    """Fits the classifier of the model in a directory and writes it there, in place of an older.
+
+    The calibration is dropped from the model's card: it rests on the classifier.
+
+    Args:
+      directory: of the model.
+      category: its name, FILE.py:NAME, or the category itself.
+      config, frames, seed: see ``fit_plausibility``.
+
+    Raises:
+      CaperError: too few frames; or see ``estimator.load``. The model is left as it was.
+    """
+    check_frame_count(frames)
+    estimator = load(category, directory)
+    fitted = fit_plausibility(estimator, config, frames, seed)
+    write_plausibility(directory, fitted)
+    kept = {name: value for name, value in estimator.card.items() if name != "calibration"}
+    origin = {"frames": frames, "seed": seed, "false_alarms": FALSE_ALARMS}
+    write_card(directory, {**kept, "plausibility": origin})
+
+
+def check_frame_count(frames: int) -> None:
+    """Raises CaperError where so many frames are too few to fit a classifier on."""
+    if frames < _FEWEST:
+        raise CaperError(f"judging plausibility needs {_FEWEST} frames or more, got {frames}")
 
 
 def _measure(variables, points, estimator: Estimator):

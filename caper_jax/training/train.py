@@ -43,11 +43,13 @@ from caper_jax.models.files import (
 )
 from caper_jax.synthetic.frames import Generator
 from caper_jax.training import fit_refiner, parallel
+from caper_jax.training.fit_plausibility import FRAMES_PER_CALIBRATED, add_plausibility
 from caper_jax.training.fit_uncertainty import calibrate
 from caper_jax.training.loop import FitResult, fit
 from caper_jax.training.objective import Objective
 from caper_jax.training.run_directory import CONFIG_FILE, STARTED_FROM
 
+_FITTED = ("params/refiner/", "params/plausibility/")  # on the estimates of the stages
 _SAMPLE = 512  # frames that give the trivial predictor of the model card
 
 
@@ -168,7 +170,8 @@ def _digest(directory: str | Path) -> str:
 
 
 def _finish(config: RunConfig, category: str | Category, directory: str | Path) -> None:
-    """Adds to a model what is fitted on its own estimates: the refiner, then its uncertainty."""
+    """Adds to a model what is fitted on its own estimates: the refiner, then what tells
+    whether they are plausible, then their uncertainty."""
     seed = config.training.seed
     refiner = config.network.refiner
     if refiner.width:
@@ -178,6 +181,8 @@ def _finish(config: RunConfig, category: str | Category, directory: str | Path) 
         except fit_refiner.UnreliableModel as error:  # a short run: usable as it is
             print(f"the refiner is not fitted: {error}", file=sys.stderr)
     if config.calibration_frames:
+        frames = FRAMES_PER_CALIBRATED * config.calibration_frames
+        add_plausibility(directory, category, config.data, frames, seed)
         estimator = load(category, directory)
         calibration = calibrate(estimator, config.data, config.calibration_frames, seed)
         write_card(directory, {**estimator.card, "calibration": calibration})
@@ -249,7 +254,7 @@ def initial_variables(
     behind.
     """
     wanted, given = flatten(template), flatten(stored)
-    given = {name: leaf for name, leaf in given.items() if not name.startswith("params/refiner/")}
+    given = {name: leaf for name, leaf in given.items() if not name.startswith(_FITTED)}
     new = {name for name in wanted if "/turn/" in name} - given.keys()
     taken = [n for n in wanted if (same_category and n not in new) or "/encoder/" in n]
     fits = all(name in given and np.shape(given[name]) == np.shape(wanted[name]) for name in taken)

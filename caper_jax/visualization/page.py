@@ -86,8 +86,10 @@ def write_page(path: str | Path, scenes: Sequence[Scene], title: str = "caper_ja
 def _scene_data(scene: Scene) -> dict[str, Any]:
     """What the page's script needs of a scene; camera frame, meters, radians."""
     category = scene.category
-    order = np.argsort(scene.labels, kind="stable")
-    points = np.asarray(scene.points)[order].astype("<f4")
+    kept = np.asarray(scene.labels) >= 0
+    labels = np.asarray(scene.labels)[kept]
+    order = np.argsort(labels, kind="stable")
+    points = np.asarray(scene.points)[kept][order].astype("<f4")
     up = np.asarray(scene.pose.rotation)[0][:, "xyz".index(category.viewpoint.up)]
     errors = scene_errors(scene)
     parts = [
@@ -112,11 +114,12 @@ def _scene_data(scene: Scene) -> dict[str, Any]:
     ]
     return {
         "name": scene.name,
+        "warning": scene.warning,
         "parts": parts,
         "joints": joints,
         "up": _rounded(up),
         "points": base64.b64encode(points.tobytes()).decode("ascii"),
-        "counts": np.bincount(scene.labels, minlength=category.num_parts).tolist(),
+        "counts": np.bincount(labels, minlength=category.num_parts).tolist(),
         "estimate": _pose_data(scene.pose, category),
         "truth": None if scene.truth is None else _pose_data(scene.truth, category),
         "image": None if scene.depth is None else _image_address(scene, scene.depth),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,7 @@ CLOUD_TITLES = ("Points by distance", "Estimate over the points", TITLES[2])
 DPI = 110
 ROW_HEIGHT = 3.9  # inches
 WIDTHS = (3.4, 3.4, 3.4, 4.3)  # inches: three views and the legend
+STRAY, WARNING = "#9a9a9a", "#B3261E"
 INK, PAPER, TRUTH = "#1a1a1a", "#f4f4f2", "#333333"
 
 Projection = Callable[[np.ndarray], np.ndarray]
@@ -145,7 +147,7 @@ def _draw_side(axes: Axes, scene: Scene) -> None:
     far_first = np.argsort(-(scene.points @ forward))
     _draw_objects(axes, scene, flat, eye=middle - 1e3 * forward, far_first=far_first)
     drawn = (box_corners(scene.pose), joint_segments(scene.pose, scene.category))
-    shown = [flat(scene.points), *(flat(points).reshape(-1, 2) for points in drawn)]
+    shown = [flat(scene.object_points), *(flat(points).reshape(-1, 2) for points in drawn)]
     extent = np.concatenate(shown)
     center, half = (extent.min(0) + extent.max(0)) / 2, 0.57 * np.ptp(extent, axis=0).max()
     _limit(axes, center - half, center + half)
@@ -156,7 +158,8 @@ def _draw_objects(
     axes: Axes, scene: Scene, flat: Projection, eye: np.ndarray, far_first: np.ndarray
 ) -> None:
     """Points, boxes and joint axes through one projection."""
-    colors = np.array([part_color(part) for part in range(scene.category.num_parts)])
+    # Strays, with label -1, take the last color.
+    colors = np.array([*map(part_color, range(scene.category.num_parts)), STRAY])
     points = flat(scene.points)[far_first]
     x, y = points.T
     axes.scatter(x, y, c=colors[scene.labels[far_first]], s=5, linewidths=0, alpha=0.75)
@@ -217,9 +220,15 @@ def _draw_legend(axes: Axes, scene: Scene) -> None:
         rows.append(("joint", "black", f"{joint_name(category, index)}   {state}{known}"))
     if truth is not None:
         rows.append(("truth", TRUTH, "ground truth"))
+    if (np.asarray(scene.labels) < 0).any():
+        rows.append(("part", STRAY, "stray points, left out"))
     pitch = min(0.095, 0.9 / (len(rows) + 1))
     axes.set_ylim(1, 0)
     axes.text(0.05, 0.045, scene.name, fontsize=13, fontweight="bold", color=INK, va="center")
+    if scene.warning:
+        text = "\n".join(textwrap.wrap(f"Do not believe this: {scene.warning}", 46))
+        style = {"fontsize": 11, "fontweight": "bold", "color": WARNING, "parse_math": False}
+        axes.text(0.05, 0.99, text, va="bottom", **style)
     for index, (kind, color, text) in enumerate(rows):
         y = 0.05 + pitch * (index + 1.1)
         if kind == "part":

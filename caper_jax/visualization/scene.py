@@ -48,12 +48,13 @@ class Scene:
       name: title of the frame.
       category: names of the parts, joint types and tree.
       points: [N, 3] object points.
-      labels: [N] predicted part of every point, 0 to K - 1.
+      labels: [N] predicted part of every point, 0 to K - 1; -1 for strays.
       pose: the estimate, arrays without batch axes ([K, ...] and [J, ...]).
       truth: ground truth of the same form, if known.
       depth: [H, W] meters, 0 where there is none, if known.
       mask: [H, W] bool, the object in ``depth``, if known.
       intrinsics: [3, 3] of ``depth``; needed with it.
+      warning: why the estimate should not be believed, in one line; "" where it may be.
 
     Raises:
       CaperError: shapes that do not fit together, or numbers that are not finite.
@@ -68,10 +69,17 @@ class Scene:
     depth: np.ndarray | None = None
     mask: np.ndarray | None = None
     intrinsics: np.ndarray | None = None
+    warning: str = ""
 
     @classmethod
     def of_frame(
-        cls, frame: Frame, category: Category, points: Any, labels: Any, pose: ArticulatedPose
+        cls,
+        frame: Frame,
+        category: Category,
+        points: Any,
+        labels: Any,
+        pose: ArticulatedPose,
+        warning: str = "",
     ) -> Scene:
         """A frame of data with its estimate; what the depth image does not measure is 0 there."""
         depth = frame.depth
@@ -85,6 +93,7 @@ class Scene:
             depth=None if depth is None else np.nan_to_num(depth, posinf=0.0, neginf=0.0),
             mask=frame.mask,
             intrinsics=frame.intrinsics,
+            warning=warning,
         )
 
     def __post_init__(self) -> None:
@@ -92,9 +101,9 @@ class Scene:
             if np.shape(array) != shape or not np.isfinite(array).all():
                 problem = f"must be finite numbers {shape}, got shape {np.shape(array)}"
                 raise CaperError(f"scene {self.name!r}: {name} {problem}")
-        if not np.isin(self.labels, np.arange(self.category.num_parts)).all():
+        if not np.isin(self.labels, np.arange(-1, self.category.num_parts)).all():
             last = self.category.num_parts - 1
-            raise CaperError(f"scene {self.name!r}: labels must be parts 0 to {last}")
+            raise CaperError(f"scene {self.name!r}: labels must be parts 0 to {last}, or -1")
 
     def _shapes(self) -> Iterator[tuple[str, Any, tuple[int, ...]]]:
         """Name, array and expected shape of everything that is given."""
@@ -108,6 +117,12 @@ class Scene:
             yield "intrinsics", self.intrinsics if self.intrinsics is not None else (), (3, 3)
             if self.mask is not None:
                 yield "mask", self.mask, np.shape(self.depth)
+
+    @property
+    def object_points(self) -> np.ndarray:
+        """[M, 3] the points but for strays; all, if there are no others."""
+        kept = self.labels >= 0
+        return np.asarray(self.points)[kept] if kept.any() else np.asarray(self.points)
 
     @property
     def poses(self) -> tuple[tuple[str, ArticulatedPose], ...]:
@@ -208,7 +223,7 @@ def crop_box(scene: Scene, margin: float = 0.06) -> tuple[np.ndarray, np.ndarray
       (low [2], high [2]) pixels; may reach beyond the image.
     """
     intrinsics = np.eye(3) if scene.intrinsics is None else scene.intrinsics
-    pixels = project(scene.points, intrinsics)
+    pixels = project(scene.object_points, intrinsics)
     low, high = pixels.min(0), pixels.max(0)
     most = (high - low).max()
     segments = joint_segments(scene.pose, scene.category)
@@ -223,7 +238,7 @@ def crop_box(scene: Scene, margin: float = 0.06) -> tuple[np.ndarray, np.ndarray
 
 def depth_range(scene: Scene) -> tuple[float, float]:
     """Depths that the colors span: those of the object and half as much again on both sides."""
-    near, far = np.percentile(np.asarray(scene.points)[:, 2], (1, 99))
+    near, far = np.percentile(scene.object_points[:, 2], (1, 99))
     reach = max(0.5 * (far - near), 0.01)
     return float(near - reach), float(far + reach)
 

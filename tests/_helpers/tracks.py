@@ -50,6 +50,10 @@ def track(name: str, truth, pose) -> Track:
         keyframe=none,
         estimated=none,
         lost=none,
+        plausible=~none,
+        reason=np.zeros(frames, np.int32),
+        size_ratio=np.ones(frames),
+        distinct_points=np.full(frames, 1024),
         seconds=np.full(frames, 0.01),
     )
 

@@ -42,6 +42,8 @@ function choose(index) {
   [...byId("scenes").children].forEach((button, i) =>
     button.setAttribute("aria-pressed", String(i === index)));
   byId("truth-toggle").hidden = !scene.truth;
+  byId("warning").hidden = !scene.warning;
+  byId("warning").textContent = `Do not believe this: ${scene.warning}`;
   byId("input").hidden = !scene.image;
   if (scene.image) byId("input").querySelector("img").src = scene.image;
   fillJoints();
