@@ -28,6 +28,7 @@ from .evaluation.protocol import evaluate
 from .export import export_estimator
 from .lie import se3, so3
 from .models import encoders
+from .models.plausibility import implausible_because
 from .synthetic.frames import Generator
 from .synthetic.videos import VideoGenerator
 from .tracker import Tracker, load_tracker
@@ -80,6 +81,7 @@ __all__ = [
     "export_estimator",
     "forward_kinematics",
     "geometry",
+    "implausible_because",
     "joints_in_camera",
     "load",
     "load_tracker",

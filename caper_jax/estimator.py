@@ -55,7 +55,7 @@ class Prediction:
       plausible: whether this can be an object of the category, whole, alone and in meters; where it
         is False, nothing else here should be believed.
       reason: why not, int32, an index into ``plausibility.REASONS``; 0 where it is plausible.
-        ``plausibility.warning`` puts it into words.
+        ``implausible_because`` puts it into words.
       plausibility: in (0, 1); below 0.5 lies one in a hundred right objects. None where the model
         has no classifier: then cloud size and number of points alone decide.
       size_ratio: size of the cloud over that usual in the category: 5 for depth in the wrong unit
@@ -133,7 +133,7 @@ def estimate(
     labels = outputs.segmentation.argmax(-1).astype(jnp.int32)
     labels = observed.selection.spread_labels(labels)
     fit = box_fit(refined, outputs.segmentation, outputs.evidence, observed, category)
-    verdict = judge(fit, variables["params"].get("plausibility"))
+    verdict = judge(fit, points.shape[1], variables["params"].get("plausibility"))
     prediction = Prediction(
         pose=articulated_pose(refined, observed.view, category),
         points=points,
@@ -280,6 +280,7 @@ def load(
     weights: str | Path | None = None,
     object_scale: float = 1.0,
     camera_roll: float = 0.0,
+    calibrated: bool = True,
 ) -> Estimator:
     """The estimator of a category.
 
@@ -292,6 +293,8 @@ def load(
         shipped models know real sizes, PartNet's objects in PM-Videos and ArtImage are larger.
       camera_roll: degrees by which upright things appear rotated clockwise in the image, 180
         for a camera upside down; the shipped models know level cameras, within 15 deg.
+      calibrated: whether to read the calibration in the card; without it, or where there is none,
+        there are no standard deviations.
 
     Raises:
       CaperError: unknown category, no model of it in the package, a damaged model, or one of
@@ -314,6 +317,8 @@ def load(
     card, variables = read_model(directory)
     if card.get("category") != name:
         raise CaperError(f"{directory} holds a model of {card.get('category')!r}, not {name!r}")
+    if not calibrated:
+        card = {name: value for name, value in card.items() if name != "calibration"}
     network = network_of(card, directory)
     _check_variables(directory, variables, definition, network)
     return Estimator(definition.scaled(object_scale).rolled(camera_roll), network, variables, card)

@@ -93,7 +93,7 @@ def run(options: Estimate) -> int:
     prediction = jax.tree.map(lambda array: np.asarray(array)[0], prediction)
     record = estimate_record(frame.name, prediction, category, cloud)
     shown = prediction.points, prediction.labels, prediction.pose
-    doubt = plausibility.warning(prediction, category)
+    doubt = plausibility.implausible_because(prediction, category)
     scene = Scene.of_frame(frame, category, *shown, warning=doubt)
 
     if doubt:

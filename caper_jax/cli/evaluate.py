@@ -150,6 +150,6 @@ def _write_worst(
         print(f"  {off[index]:6.1f} deg  {frame.name}")
         prediction = estimator(cloud_of(frame, NUM_POINTS))
         shown = prediction.points, prediction.labels, prediction.pose
-        doubt = plausibility.warning(prediction, dataset.category)
+        doubt = plausibility.implausible_because(prediction, dataset.category)
         scenes.append(Scene.of_frame(frame, dataset.category, *shown, warning=doubt))
     write_picture(path, scenes)

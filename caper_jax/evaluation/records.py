@@ -190,11 +190,11 @@ def frame_record(
 
 def _verdict(result: Prediction | TrackResult, category: Category) -> dict[str, Any]:
     """Whether a result can be believed, and in one line why not."""
-    from caper_jax.models.plausibility import warning
+    from caper_jax.models.plausibility import implausible_because
 
     return {
         "plausible": bool(result.plausible),
-        "reason": warning(result, category) or None,
+        "reason": implausible_because(result, category) or None,
         "size_ratio": round(float(result.size_ratio), 4),
         "distinct_points": int(result.distinct_points),
     }

@@ -244,7 +244,7 @@ def format_tracks(
     for track in tracks:
         if doubtful := int((~track.plausible).sum()):
             first = int(np.argmin(track.plausible))
-            reason = plausibility.warning(_result(track, first), category)
+            reason = plausibility.implausible_because(_result(track, first), category)
             count = _count(doubtful, "implausible frame")
             text = f"{_shorten(track.name)}: {count}, the first is {track.frames[first]}: {reason}"
             lines += textwrap.wrap(text, 80)

@@ -36,6 +36,7 @@ class CardFields:
       mean_pose: the trivial predictor, see ``training.train.mean_pose``.
       calibration: see ``models.uncertainty``.
       refiner: what the refiner was fitted on.
+      plausibility: what the classifier of plausibility was fitted on.
       complete: which run it is of, once all that belongs to the model is written.
     """
 
@@ -50,6 +51,7 @@ class CardFields:
     mean_pose: dict[str, Any] | None = None
     calibration: dict[str, Any] | None = None
     refiner: dict[str, Any] | None = None
+    plausibility: dict[str, Any] | None = None
     complete: str | None = None
 
 

@@ -225,11 +225,12 @@ def _distances(estimate: StageEstimate, cloud: Float[Array, "B N 3"], category: 
     return own, outside, outside - jnp.minimum(over.max(-1), 0.0)
 
 
-def judge(fit: BoxFit, params: dict[str, Any] | None) -> Verdict:
+def judge(fit: BoxFit, number: int, params: dict[str, Any] | None) -> Verdict:
     """Whether an estimate can be believed, and why not.
 
     Args:
       fit: of the estimate.
+      number: of points in the cloud, equal ones too.
       params: of the classifier; None for a model without one, whose verdict rests on the size of
         the cloud and the number of points alone.
     """
@@ -240,7 +241,7 @@ def judge(fit: BoxFit, params: dict[str, Any] | None) -> Verdict:
         score = logits[:, 0] - jax.nn.logsumexp(logits[:, 1:], axis=-1) - params["threshold"]
         likeliest = 1 + logits[:, 1:].argmax(-1).astype(jnp.int32)
         reason = jnp.where(score < 0, likeliest, reason)
-    reason = rules(reason, fit.log_size, fit.distinct, params)
+    reason = rules(reason, fit.log_size, fit.distinct, number, params)
     low, usual, high = size_bounds(params)
     if score is not None:
         # What a rule finds is no less implausible than what the classifier finds.
@@ -254,12 +255,19 @@ def size_bounds(params: dict[str, Any] | None) -> Any:
     return (_LOW, _USUAL, _HIGH) if params is None else params["log_size"]
 
 
-def rules(reason, log_size, distinct, params: dict[str, Any] | None):
-    """The reason of a verdict, where size or number of points alone do not decide it."""
+def rules(reason, log_size, distinct, number: int, params: dict[str, Any] | None):
+    """The reason of a verdict, where size or number of points alone do not decide it.
+
+    Args:
+      reason: [B] int32, of the classifier or of an earlier estimate.
+      log_size, distinct: [B], see ``BoxFit``.
+      number: of points, equal ones too: small networks take fewer.
+      params: see ``judge``.
+    """
     low, _, high = size_bounds(params)
     reason = jnp.where(log_size > high, TOO_LARGE, reason)
     reason = jnp.where(log_size < low, TOO_SMALL, reason)
-    return jnp.where(distinct < DOUBTFUL_POINTS, FEW_POINTS, reason)
+    return jnp.where(distinct < min(DOUBTFUL_POINTS, number // 2), FEW_POINTS, reason)
 
 
 def widening(score: Float[Array, "B"]) -> Float[Array, "B"]:
@@ -268,14 +276,14 @@ def widening(score: Float[Array, "B"]) -> Float[Array, "B"]:
 
 
 class Judged(Protocol):
-    """What ``warning`` reads of a prediction or of a result of the tracker."""
+    """What ``implausible_because`` reads of a prediction or of a result of the tracker."""
 
     reason: Any
     size_ratio: Any
     distinct_points: Any
 
 
-def warning(result: Judged, category: Category) -> str:
+def implausible_because(result: Judged, category: Category) -> str:
     """One line on why a result is not plausible, with the likely cause; "" where it is.
 
     Args:

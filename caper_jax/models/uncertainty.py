@@ -136,5 +136,8 @@ def from_card(section: Mapping[str, Any], num_parts: int, source: str) -> Calibr
         except (KeyError, TypeError, ValueError) as error:
             raise CaperError(f"{source}: calibration lacks numbers for {name!r}") from error
         if values[name].shape != shape or not np.isfinite(values[name]).all():
-            raise CaperError(f"{source}: calibration {name} must be finite numbers {shape}")
+            raise CaperError(
+                f"{source}: calibration {name} must be finite numbers {shape}, as this version "
+                "writes them; calibrate again (caper calibrate)"
+            )
     return Calibration(**values)

@@ -343,7 +343,7 @@ def _track_step(
     distinct = selection.inliers.distinct
     size = log_size(points[None], category)
     classifier = variables["params"].get("plausibility")
-    reason = rules(measurement.reason[None], size, distinct, classifier)[0]
+    reason = rules(measurement.reason[None], size, distinct, len(points), classifier)[0]
     reason = jnp.where(frame.present, reason, FEW_POINTS).astype(jnp.int32)
     return after, TrackResult(
         pose=_articulated_pose(after, category),

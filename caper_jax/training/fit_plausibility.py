@@ -59,7 +59,8 @@ _RATE = 3e-3
 _DECAY = 0.1
 _NOISE = 0.1  # added to features, which are few
 _PER_CALL = 500
-_MARGIN = 0.1  # of the logarithm of sizes, beyond those seen
+_RARE = 1e-3  # share of objects of unseen frames that are smaller, and larger, than ...
+_MARGIN = 0.15  # ... what a cloud may be, less a margin of the logarithm
 # How much each class counts against right objects, which count as much as all together: halves of
 # an object look like objects whose other half is hidden.
 _WEIGHTS = {SIZE: 1.0, OTHER: 2.0, SEVERAL: 2.0, PART: 0.25}
@@ -94,7 +95,7 @@ def fit_plausibility(
     right = np.concatenate([batch.points for batch in batches])
     clean = np.concatenate([batch.points for batch in batches[1::3]])
     labels = np.concatenate([batch.labels for batch in batches[1::3]])
-    features, sizes = measured(right)
+    features, _ = measured(right)
     samples = [(features, np.full(len(features), PLAUSIBLE))]
     wrong = wrong_clouds(estimator, clean, labels, config, frames, rng)
     with progress("judging wrong objects", total=frames) as bar:
@@ -111,8 +112,8 @@ def fit_plausibility(
     unseen_features, unseen_sizes = (np.concatenate(column) for column in zip(*unseen, strict=True))
     features, classes = (np.concatenate(column) for column in zip(*samples, strict=True))
     params = _fit(features, classes, seed)
-    sizes = np.concatenate([sizes, unseen_sizes])
-    bounds = [sizes.min() - _MARGIN, np.median(sizes), sizes.max() + _MARGIN]
+    low, usual, high = np.quantile(unseen_sizes, [_RARE, 0.5, 1.0 - _RARE])
+    bounds = [low - _MARGIN, usual, high + _MARGIN]
     logits: Any = PlausibilityClassifier().apply({"params": params}, unseen_features)
     score = logits[:, 0] - jax.nn.logsumexp(logits[:, 1:], axis=-1)
     threshold = np.quantile(np.asarray(score), FALSE_ALARMS)
@@ -140,12 +141,11 @@ def add_plausibility(
       CaperError: too few frames; or see ``estimator.load``. The model is left as it was.
     """
     check_frame_count(frames)
-    estimator = load(category, directory)
+    estimator = load(category, directory, calibrated=False)
     fitted = fit_plausibility(estimator, config, frames, seed)
     write_plausibility(directory, fitted)
-    kept = {name: value for name, value in estimator.card.items() if name != "calibration"}
     origin = {"frames": frames, "seed": seed, "false_alarms": FALSE_ALARMS}
-    write_card(directory, {**kept, "plausibility": origin})
+    write_card(directory, {**estimator.card, "plausibility": origin})
 
 
 def check_frame_count(frames: int) -> None:
@@ -194,7 +194,7 @@ def wrong_clouds(
     usual = np.median(_radii(right))
     resized = usual / _radii(others[:count]) * np.exp(rng.normal(0.0, 0.25, count))
     yield OTHER, others[:count] * resized[:, None, None].astype(np.float32)
-    yield OTHER, walls(count, right.shape[1], diagonal, rng)
+    yield OTHER, walls(2 * count, right.shape[1], diagonal, rng)
     yield SEVERAL, side_by_side(_pick(right, count, rng), right, rng)
     yield SEVERAL, side_by_side(_pick(right, count, rng), others, rng)
     alone = single_parts(right, labels, category.num_parts, count, rng)
@@ -242,9 +242,10 @@ def walls(
         flat = np.resize(flat, (number, 2)) * side * [np.sqrt(aspect), 1 / np.sqrt(aspect)]
         depth = diagonal * rng.uniform(1.5, 6.0)
         turn, slope = rng.uniform(0, 2 * np.pi), np.tan(np.radians(rng.uniform(0, 70)))
-        z = np.maximum(depth + slope * flat @ [np.cos(turn), np.sin(turn)], 0.2 * depth)
-        z += rng.normal(0.0, 0.002 * depth, number)
-        clouds.append(np.column_stack([flat * (z / depth)[:, None], z]))
+        rays = flat / depth  # where they meet the plane, z (1 + slope . ray) is depth
+        rise = slope * rays @ [np.cos(turn), np.sin(turn)]
+        z = depth / np.clip(1.0 + rise, 0.3, 3.0) + rng.normal(0.0, 0.002 * depth, number)
+        clouds.append(np.column_stack([rays * z[:, None], z]))
     return np.asarray(clouds, np.float32)
 
 

@@ -134,7 +134,7 @@ def add_refiner(
     Raises:
       CaperError: see ``fit_refiner`` and ``estimator.load``; the model is left as it was.
     """
-    estimator = load(category, directory)
+    estimator = load(category, directory, calibrated=False)
     card, variables = estimator.card, estimator.variables
     width = width or estimator.network.refiner.width or PRESETS["fast"].network.refiner.width
     fitted = fit_refiner(estimator, config, width, frames, seed)
@@ -142,9 +142,8 @@ def add_refiner(
     network = card["run"]["network"]
     refiner = {**network.get("refiner", {}), "width": width}
     run = {**card["run"], "network": {**network, "refiner": refiner}}
-    kept = {name: value for name, value in card.items() if name != "calibration"}
     origin = {"frames": frames, "split": _SPLIT, "seed": seed}
-    write_model(directory, {**variables, "params": params}, {**kept, "run": run, "refiner": origin})
+    write_model(directory, {**variables, "params": params}, {**card, "run": run, "refiner": origin})
 
 
 def _measure(variables, batch: Batch, category: Category, network: NetworkConfig):

@@ -227,7 +227,12 @@ def _draw_legend(axes: Axes, scene: Scene) -> None:
     axes.text(0.05, 0.045, scene.name, fontsize=13, fontweight="bold", color=INK, va="center")
     if scene.warning:
         text = "\n".join(textwrap.wrap(f"Do not believe this: {scene.warning}", 46))
-        style = {"fontsize": 11, "fontweight": "bold", "color": WARNING, "parse_math": False}
+        style: dict[str, Any] = {
+            "fontsize": 11,
+            "fontweight": "bold",
+            "color": WARNING,
+            "parse_math": False,
+        }
         axes.text(0.05, 0.99, text, va="bottom", **style)
     for index, (kind, color, text) in enumerate(rows):
         y = 0.05 + pitch * (index + 1.1)
