@@ -26,6 +26,7 @@ EXAMPLES = (
     ("table10 --weights runs/arm --frames 1000", "errors against frame, long videos"),
     ("table9 --category box --seeds 3 --minutes 30", "trains six models"),
     ("table7 --category laptop --steps 4000 --seeds 1", "trains two models"),
+    ("robustness --category box", "what stray points do"),
     ("jitter --category box --videos 4", "a quick look"),
 )
 SECTIONS = {name: text for name, text in TRAINING_SECTIONS.items() if name != "loader"}
@@ -43,6 +44,7 @@ _TRAINED = (
     *("category", "frames", "data", "format", "split", "seed", "noise"),
     *("seeds", "minutes", "steps", "initial", "settings"),
 )
+_ROBUST = ("category", "frames", "weights", "seed", "noise")
 _MOVING = ("category", "videos", "frames", "weights", "seed", "noise", "network_alone")
 
 
@@ -88,6 +90,10 @@ REPRODUCTIONS = {
         "tracking", "keyframes none, fixed or dynamic; error against frame", _TRACKING
     ),
     "reliability": Reproduction("static", "how often the truth lies where the model says", _STATIC),
+    "robustness": Reproduction("robustness", "stray points, loose masks and few points", _ROBUST),
+    "plausibility": Reproduction(
+        "robustness", "which wrong units and wrong objects a model recognizes", _ROBUST
+    ),
     "jitter": Reproduction("motion", "jitter on an object that stands still", _MOVING),
     "modes": Reproduction("motion", "errors by how camera and joints move", _MOVING),
 }

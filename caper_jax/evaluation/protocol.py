@@ -26,8 +26,8 @@ BATCH_SIZE = 16
 NUM_POINTS = 1024
 Tree = TypeVar("Tree")
 
-# Poses [B, K, ...] for B frames and their clouds [B, N, 3], meters; or predictions, which also say
-# whether they are plausible.
+# Poses [B, K, ...] for B frames and their clouds [B, N, 3], meters; or predictions with a ``pose``,
+# which may also say whether they are ``plausible``.
 Predictor = Callable[[Sequence[Frame], np.ndarray], ArticulatedPose | Prediction]
 
 
@@ -92,11 +92,11 @@ def evaluate(
             if start == 0:
                 predictor(padded, clouds)  # compiles
             began = time.perf_counter()
-            batch: Any = jax.tree.map(np.asarray, predictor(padded, clouds))
+            batch: Any = jax.block_until_ready(predictor(padded, clouds))
             seconds += time.perf_counter() - began
-            if not isinstance(batch, ArticulatedPose):
-                verdicts.append(batch.plausible[: len(frames)])
-                batch = batch.pose
+            if (plausible := getattr(batch, "plausible", None)) is not None:
+                verdicts.append(np.asarray(plausible)[: len(frames)])
+            batch = jax.tree.map(np.asarray, getattr(batch, "pose", batch))
             names += [frame.name for frame in frames]
             truths += [_truth(frame, dataset.category) for frame in frames]
             visibility += [unknown if f.visibility is None else f.visibility for f in frames]

@@ -256,7 +256,7 @@ def format_report(report: dict[str, Any]) -> str:
 
 def _format_plausible(report: dict[str, Any]) -> list[str]:
     """How many estimates the model does not believe, and errors with and without them."""
-    share = f"implausible, by the model's own word: {100 * report['implausible']:.1f} % of frames"
+    share = f"implausible by its own word: {100 * report['implausible']:.1f} % of frames"
     if "plausible_only" not in report or not report["implausible"]:
         return [share]
     rows = []

@@ -240,7 +240,7 @@ def judge(fit: BoxFit, number: int, params: dict[str, Any] | None) -> Verdict:
         logits: Any = PlausibilityClassifier().apply({"params": params}, fit.features)
         score = logits[:, 0] - jax.nn.logsumexp(logits[:, 1:], axis=-1) - params["threshold"]
         likeliest = 1 + logits[:, 1:].argmax(-1).astype(jnp.int32)
-        reason = jnp.where(score < 0, likeliest, reason)
+        reason = jnp.where(score >= 0, reason, likeliest)  # what is not a number is not right
     reason = rules(reason, fit.log_size, fit.distinct, number, params)
     low, usual, high = size_bounds(params)
     if score is not None:

@@ -90,4 +90,8 @@ class KnownTracker:
             keyframe=first,
             estimator_queried=False,
             lost=first,
+            plausible=not first,
+            reason=np.int32(3 if first else 0),
+            size_ratio=1.0,
+            distinct_points=len(points),
         )

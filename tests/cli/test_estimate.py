@@ -11,11 +11,12 @@ from PIL import Image
 
 from caper_jax import cli, estimator
 from caper_jax.estimator import Prediction
+from caper_jax.models import plausibility
 
 CAMERA = {"fx": 300.0, "fy": 310.0, "cx": 79.5, "cy": 59.5}
 
 
-def prediction(points, pose):
+def prediction(points, pose, reason=0):
     return Prediction(
         pose=pose,
         points=points,
@@ -23,7 +24,12 @@ def prediction(points, pose):
         confidence=np.array([[0.75, 0.5]], np.float32),
         degenerate=np.array([False]),
         points_per_part=np.array([[points.shape[1] - 3, 3]], np.int32),
-        evidence=np.zeros((1, 2, 6), np.float32),
+        plausible=np.array([reason == 0]),
+        reason=np.array([reason], np.int32),
+        size_ratio=np.array([5.0], np.float32),
+        distinct_points=np.array([points.shape[1]], np.int32),
+        evidence=np.zeros((1, 2, 12), np.float32),
+        plausibility=np.array([0.25], np.float32),
         rotation_std=np.radians(np.array([[1.25, 2.5]], np.float32)),
         translation_std=np.array([[0.004, 0.006]], np.float32),
         state_std=np.radians(np.array([[3.0]], np.float32)),
@@ -95,6 +101,35 @@ def test_pose_is_printed_and_written(files, seen, capsys):
     assert "base – lid: standard deviation 3.0°" in table
     assert "lid: hidden (3 points), known through its joint alone" in table
     assert max(map(len, table.splitlines())) <= 80
+
+
+def test_what_is_not_plausible_is_said_in_one_line(files, monkeypatch, capsys):
+    class Doubting:
+        def __call__(self, points):
+            found = prediction(points, random_pose(1), plausibility.TOO_LARGE)
+            labels = np.array(found.labels)
+            labels[0, :7] = -1
+            return found.replace(labels=labels)
+
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: Doubting())
+    outputs = ["--json", "pose.json", "--picture", "pose.png", "--page", "pose.html"]
+    assert run(*IMAGE, "--mask", "mask.png", *outputs) == 0
+    captured = capsys.readouterr()
+    (warning,) = [line for line in captured.err.splitlines() if line.startswith("warning: ")]
+    assert "5.0 times too large" in warning and "--depth-scale 0.0002" in warning
+    assert "7 of 1024 points looked at lie alone, and were left out" in captured.out
+    record = json.loads((files / "pose.json").read_text())
+    assert record["plausible"] is False and warning.endswith(record["reason"])
+    assert (record["size_ratio"], record["plausibility"]) == (5.0, 0.25)
+    assert record["distinct_points"] == 1024
+    assert "5.0 times too large" in (files / "pose.html").read_text()
+
+
+def test_what_is_plausible_needs_no_warning(files, seen, capsys):
+    assert run(*IMAGE, "--mask", "mask.png", "--json", "pose.json") == 0
+    assert "warning" not in capsys.readouterr().err
+    record = json.loads((files / "pose.json").read_text())
+    assert record["plausible"] is True and record["reason"] is None
 
 
 def test_a_detection_box_takes_the_table_away(files, seen):

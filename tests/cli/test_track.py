@@ -23,6 +23,7 @@ from caper_jax.data import hdf5
 from caper_jax.data.live import pack_frame, read_frames
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.tracking import Track, format_tracks
+from caper_jax.models import plausibility
 from caper_jax.tracker import Tracker
 from caper_jax.tracking.step import TrackResult
 from caper_jax.visualization.track import evenly_spaced, write_states
@@ -55,7 +56,9 @@ class Scripted(Tracker):
         self.given.append(labels)
         self.number += 1
         second, energy = self.number == 2, np.float32(0.01 * self.number)
-        return TrackResult(pose, np.arange(POINTS) % 2, energy, second, second, missing)
+        reason = np.int32(plausibility.FEW_POINTS if missing else plausibility.PLAUSIBLE)
+        verdict = not missing, reason, np.float32(1.0), np.int32(0 if missing else POINTS)
+        return TrackResult(pose, np.arange(POINTS) % 2, energy, second, second, missing, *verdict)
 
 
 @pytest.fixture
@@ -298,12 +301,24 @@ class TestLive:
 class TestReport:
     """Records and tables of any category."""
 
-    def track(self, name):
+    def track(self, name, reasons=(0, 0, 0)):
         pose = jax.tree.map(lambda array: np.stack([array] * 3), arm_pose())
         marks = np.array([True, False, False])
         energy = np.array([2.0, 0.01, 0.02])
         return Track(
-            name, ["a", "b", "c"], pose, pose, energy, marks, marks, ~marks, np.ones(3) * 0.02
+            name=name,
+            frames=["a", "b", "c"],
+            pose=pose,
+            truth=pose,
+            energy=energy,
+            keyframe=marks,
+            estimated=marks,
+            lost=~marks,
+            plausible=np.array(reasons) == 0,
+            reason=np.array(reasons),
+            size_ratio=np.ones(3),
+            distinct_points=np.full(3, 60),
+            seconds=np.ones(3) * 0.02,
         )
 
     def test_long_names_keep_the_table_narrow(self):
@@ -313,6 +328,14 @@ class TestReport:
         assert max(map(len, lines)) <= 100
         assert lines[-2].split()[0].endswith("/tail")
         assert lines[-1].split() == ["short", "3", "1", "1", "2", "20.0"]
+
+    def test_implausible_frames_are_counted_and_explained(self):
+        arguments = (ARM, TrackerConfig(), "estimator", "masks", "predicted", None)
+        reasons = (0, plausibility.FEW_POINTS, plausibility.SEVERAL)
+        text = format_tracks([self.track("one", reasons), self.track("two")], *arguments)
+        joined = " ".join(text.split())
+        assert "one: 2 implausible frames, the first is b: only 60 different points" in joined
+        assert "two: " not in joined and max(map(len, text.splitlines())) <= 80
 
     def test_curves_of_both_kinds_of_joints(self, tmp_path):
         for threshold in (0.03, None):

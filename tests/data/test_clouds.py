@@ -7,10 +7,12 @@ import trimesh
 from caper_jax.data.clouds import (
     are_sampled,
     cloud_from_depth,
+    count_distinct,
     fit_support_plane,
     mask_from_box,
     read_points,
     sample_points,
+    shows_object,
     systematic_indices,
 )
 from caper_jax.errors import CaperError
@@ -112,10 +114,10 @@ def test_thin_objects_keep_enough_pixels():
 
 def test_small_objects_are_filled_up_by_repeating():
     mask = np.zeros(SHAPE, bool)
-    mask[50:55, 60:65] = True
+    mask[50:57, 60:67] = True
     cloud = cloud_from_depth(slope(), mask, K, num_points=1024)
-    assert cloud.available == 25
-    assert len(np.unique(cloud.points, axis=0)) == 25
+    assert cloud.available == 49
+    assert len(np.unique(cloud.points, axis=0)) == 49
 
 
 def test_far_outliers_go_only_when_asked():
@@ -141,11 +143,29 @@ def test_bad_images_are_named():
     with pytest.raises(CaperError, match="float image"):
         cloud_from_depth((depth * 1000).astype(np.uint16), mask, K)
     few = np.zeros(SHAPE, bool)
-    few[0, :15] = True
-    with pytest.raises(CaperError, match="only 15 of 15 masked pixels are usable; at least 16"):
+    few[0, :47] = True
+    with pytest.raises(CaperError, match="only 47 of 47 masked pixels are usable; at least 48"):
         cloud_from_depth(depth, few, K)
     with pytest.raises(CaperError, match="intrinsics has shape"):
         cloud_from_depth(depth, mask, K[:2])
+
+
+def test_equal_points_count_once():
+    rng = np.random.default_rng(0)
+    points = (rng.normal(size=(60, 3)) * 0.1 + [0, 0, 1]).astype(np.float32)
+    np.testing.assert_array_equal(count_distinct(points[None]), 60)
+    np.testing.assert_array_equal(count_distinct(np.resize(points[:7], (2, 60, 3))), 7)
+    zeros = np.zeros((1, 9, 3), np.float32)
+    zeros[0, 4] = -0.0
+    assert count_distinct(zeros) == 1
+    with pytest.raises(CaperError, match="only 47 of 300 usable points in points differ"):
+        sample_points(np.resize(points[:47], (300, 3)))
+    with pytest.raises(CaperError, match="all 200 usable points of points are the same point"):
+        sample_points(np.resize(points[:1], (200, 3)))
+    assert sample_points(np.resize(points[:48], (300, 3))).available == 300
+    assert shows_object(np.resize(points[:48], (5000, 3)))
+    assert not shows_object(np.resize(points[:47], (5000, 3)))
+    assert not are_sampled(np.resize(points[:47], (1, 300, 3)), 300)
 
 
 def test_raw_clouds_are_checked():

@@ -16,7 +16,7 @@ from caper_jax.data.loader import Loader
 from caper_jax.data.types import Frame
 from caper_jax.errors import CaperError
 
-FRAMES, POINTS = 10, 40
+FRAMES, POINTS = 10, 64
 
 
 class Frames:
@@ -140,7 +140,7 @@ def test_frames_that_show_too_little_are_passed_over():
     nothing = Frames(lambda frame, i: replace(frame, points=frame.points[:3]))
     with (
         Loader(nothing, 2, 16, process=(0, 1)) as loader,
-        pytest.raises(CaperError, match="no frame of the memory data shows 16 points of box"),
+        pytest.raises(CaperError, match="no frame of the memory data shows 48 points of box"),
     ):
         loader(0)
 

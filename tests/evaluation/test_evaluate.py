@@ -261,7 +261,9 @@ def test_the_worst_frames_are_named_and_drawn(path, tmp_path, monkeypatch, capsy
             poses = [self.pose(cloud) for cloud in clouds]
             pose = jax.tree.map(lambda *a: np.stack(a), *poses) if points.ndim == 3 else poses[0]
             labels = np.zeros(points.shape[:-1], np.int32)
-            return types.SimpleNamespace(pose=pose, points=points, labels=labels)
+            return types.SimpleNamespace(
+                pose=pose, points=points, labels=labels, reason=0, size_ratio=1
+            )
 
         def pose(self, cloud):
             frame = next(f for other, f in known if np.array_equal(cloud, other))
@@ -389,3 +391,35 @@ def test_reartmix_truth_scores_perfectly(shared_data, tmp_path, capsys):
     assert metrics["mask_source"] == "annotated polygons" and metrics["failures"] == 0
     assert metrics["parts"][1]["rotation_deg"]["mean"] == 0
     assert metrics["parts"][1]["iou_full"]["mean"] == 1
+
+
+def test_errors_stand_with_and_without_what_is_implausible(path, tmp_path):
+    """Every third frame is turned by 90 deg, and the predictor doubts it."""
+    dataset, shown = Hdf5Dataset(path), []
+
+    def predict(frames, points):
+        number = len(shown) + np.arange(len(frames))
+        shown.extend(frames)
+        pose = protocol.truth_predictor(frames, points)
+        angle = np.where(number % 3 == 0, 90.0, 0.0)
+        turn = Rotation.from_euler("x", angle[:, None], degrees=True)
+        rotation = pose.rotation @ turn.as_matrix()[:, None]
+        return types.SimpleNamespace(
+            pose=dataclasses.replace(pose, rotation=rotation), plausible=number % 3 != 0
+        )
+
+    compiled = iter([lambda *_: None])
+    evaluation = protocol.evaluate(
+        dataset, lambda *given: next(compiled, predict)(*given), batch_size=7
+    )
+    result = report.summarize(evaluation, dataset, "model", None)
+    assert result["implausible"] == pytest.approx(1 / 3)
+    for part, other in zip(result["parts"], result["plausible_only"]["parts"], strict=True):
+        assert part["rotation_deg"]["mean"] == pytest.approx(30.0, abs=0.01)
+        assert other["rotation_deg"]["mean"] == pytest.approx(0.0, abs=0.01)
+    text = report.format_report(result)
+    assert "33.3 % of frames; errors with and without them" in text
+    assert max(map(len, text.splitlines())) <= 80
+    report.write_report(tmp_path, evaluation, result)
+    with np.load(tmp_path / report.PREDICTIONS_FILE) as stored:
+        np.testing.assert_array_equal(stored["plausible"], np.arange(FRAMES) % 3 != 0)

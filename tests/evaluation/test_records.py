@@ -11,13 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from caper_jax.errors import CaperError
 from caper_jax.evaluation.records import FRAMES, frame_record, json_line
+from caper_jax.models import plausibility
 from caper_jax.tracking.step import TrackResult
 
 
-def record_of(pose):
-    return frame_record(
-        "f", TrackResult(pose, None, np.float32(0.02), True, False, False), ARM, 0.0125
-    )
+def record_of(pose, reason=0):
+    verdict = (reason == 0, np.int32(reason), np.float32(1.5), np.int32(640))
+    result = TrackResult(pose, None, np.float32(0.02), True, False, False, *verdict)
+    return frame_record("f", result, ARM, 0.0125)
 
 
 def test_units_and_parts():
@@ -34,6 +35,15 @@ def test_units_and_parts():
     assert record["milliseconds"] == 12.5 and record["energy"] == 0.02
     assert (record["keyframe"], record["estimated"], record["lost"]) == (True, False, False)
     assert json.loads(json_line(record)) == record
+
+
+def test_what_is_not_plausible_says_why():
+    record = record_of(arm_pose())
+    assert (record["plausible"], record["reason"]) == (True, None)
+    assert (record["size_ratio"], record["distinct_points"]) == (1.5, 640)
+    doubted = record_of(arm_pose(), plausibility.SEVERAL)
+    assert doubted["plausible"] is False and "more than one object" in doubted["reason"]
+    assert json.loads(json_line(doubted)) == doubted
 
 
 def test_every_spatial_field_names_its_frame():

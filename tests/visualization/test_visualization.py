@@ -260,7 +260,11 @@ def test_demo_writes_pictures_and_a_page_and_prints_errors(tmp_path, monkeypatch
             confidence=np.ones((1, 2), np.float32),
             degenerate=np.zeros(1, bool),
             points_per_part=np.full((1, 2), 99, np.int32),
-            evidence=np.zeros((1, 2, 6), np.float32),
+            plausible=np.ones(1, bool),
+            reason=np.zeros(1, np.int32),
+            size_ratio=np.ones(1, np.float32),
+            distinct_points=np.full(1, 512, np.int32),
+            evidence=np.zeros((1, 2, 12), np.float32),
         )
 
     monkeypatch.setattr("caper_jax.estimator.load", lambda category: estimator)
