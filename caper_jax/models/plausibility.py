@@ -45,6 +45,7 @@ _NEAR = (0.02, 0.05)  # distances, in diagonals
 _FLOOR = 1e-3
 # Logarithms of the cloud's size over the category's that a model which was not fitted takes.
 _LOW, _USUAL, _HIGH = np.log([0.35, 1.0, 2.5]).tolist()
+_FAR_OFF = 2.5
 _GROWTH = 5.0  # largest logarithm by which implausibility widens standard deviations
 
 
@@ -264,9 +265,11 @@ def rules(reason, log_size, distinct, number: int, params: dict[str, Any] | None
       number: of points, equal ones too: small networks take fewer.
       params: see ``judge``.
     """
-    low, _, high = size_bounds(params)
-    reason = jnp.where(log_size > high, TOO_LARGE, reason)
-    reason = jnp.where(log_size < low, TOO_SMALL, reason)
+    low, usual, high = size_bounds(params)
+    # Of what is not plausible anyway, a size that is far off is the likeliest cause.
+    wrong, far = reason != PLAUSIBLE, np.log(_FAR_OFF)
+    reason = jnp.where((log_size > high) | (wrong & (log_size > usual + far)), TOO_LARGE, reason)
+    reason = jnp.where((log_size < low) | (wrong & (log_size < usual - far)), TOO_SMALL, reason)
     return jnp.where(distinct < min(DOUBTFUL_POINTS, number // 2), FEW_POINTS, reason)
 
 

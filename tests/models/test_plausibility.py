@@ -142,6 +142,12 @@ def test_the_classifier_weighs_right_against_all_else():
         assert verdict.plausible[0] == (threshold < score)
         expected = PLAUSIBLE if threshold < score else 1 + logits[1:].argmax()
         assert verdict.reason[0] == expected
+    # What is wrong and far from the usual size is wrong because of its size.
+    params["threshold"] = jnp.float32(score + 0.1)
+    params["log_size"] = jnp.log(jnp.array([0.1, 1.0, 10.0]))
+    for ratio, reason in ((0.3, TOO_SMALL), (2.0, expected), (4.0, TOO_LARGE)):
+        assert judge(a_fit(np.log(ratio), features=features), 1024, params).reason[0] == reason
+    params["log_size"] = jnp.log(jnp.array([0.5, 1.0, 2.0]))
     # What a rule finds is implausible for the score as well.
     params["threshold"] = jnp.float32(-100.0)
     assert judge(a_fit(np.log(5.0), features=features), 1024, params).score[0] < 0

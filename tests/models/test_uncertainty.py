@@ -21,21 +21,21 @@ from caper_jax.estimator import Estimator, load
 from caper_jax.models import uncertainty
 from caper_jax.models.files import write_model
 from caper_jax.reproduce.static import ball_share, interval_share
-from caper_jax.training import fit_uncertainty
+from caper_jax.training import fit_plausibility, fit_uncertainty
 
 BOX = categories.get("box")
 
 
 def section(**changes):
     """A calibration of two parts that says 0.1 rad, 0.2 units and 0.3 rad of every frame."""
-    zeros = np.zeros(uncertainty.EVIDENCE).tolist()
+    zeros = np.zeros(uncertainty.ALL_EVIDENCE).tolist()
     rows = {name: [*zeros, float(np.log(value))] for name, value in (("r", 0.1), ("t", 0.2))}
     return {
         "rotation": [rows["r"]] * 2,
         "translation": [rows["t"]] * 2,
         "state": [[*zeros, float(np.log(0.3))]],
-        "low": [-1.0] * uncertainty.EVIDENCE,
-        "high": [1.0] * uncertainty.EVIDENCE,
+        "low": [-1.0] * uncertainty.ALL_EVIDENCE,
+        "high": [1.0] * uncertainty.ALL_EVIDENCE,
     } | changes
 
 
@@ -62,9 +62,10 @@ def test_evidence_counts_doubts_and_asks_about_parts():
 def test_radii_grow_with_the_evidence_up_to_what_was_seen():
     rotation = np.array(section()["rotation"])
     rotation[1, 0] = 2.0
-    card = section(rotation=rotation.tolist(), state=[[0, 3.0, 0, 0, 0, 0, 0]])
+    state = [0.0, 3.0] + [0.0] * (uncertainty.ALL_EVIDENCE - 1)
+    card = section(rotation=rotation.tolist(), state=[state])
     fitted = uncertainty.from_card(card, 2, "card")
-    found = np.zeros((3, 2, uncertainty.EVIDENCE), np.float32)
+    found = np.zeros((3, 2, uncertainty.ALL_EVIDENCE), np.float32)
     found[1:, :, 0], found[:, 1, 1] = [[0.5], [50.0]], 0.25
     turn, shift, state = uncertainty.radii(fitted, found)
     np.testing.assert_allclose(turn[:, 0], 0.1, rtol=1e-5)
@@ -121,7 +122,7 @@ def test_quantile_regression_is_the_linear_program(level):
     ("changes", "message"),
     [
         ({"low": [0.0]}, "calibration low must be finite numbers"),
-        ({"state": [[float("nan")] * 7]}, "calibration state must be finite numbers"),
+        ({"state": [[float("nan")] * 13]}, "calibration state must be finite numbers"),
         ({"rotation": "no"}, "calibration lacks numbers for 'rotation'"),
     ],
 )
@@ -147,19 +148,30 @@ class TestModel:
         assert found.rotation_std is found.state_std is None
         assert found.points_per_part.sum() == 64 and found.evidence.shape == (
             2,
-            uncertainty.EVIDENCE,
+            uncertainty.ALL_EVIDENCE,
         )
 
     def test_calibrate_makes_the_stated_region_hold_the_truth(
         self, folder, tmp_path, monkeypatch, capsys
     ):
         monkeypatch.setattr("caper_jax.config.TRAINING_DATA", self.CONFIG)
+        # Other categories' objects take a minute to compile; test_plausibility has them.
+        monkeypatch.setattr(
+            fit_plausibility,
+            "other_objects",
+            lambda estimator, config, count, seed: fit_plausibility.walls(
+                count, 64, 0.5, np.random.default_rng(seed)
+            ),
+        )
+        monkeypatch.setattr(fit_plausibility, "_STEPS", 500)
         command = ["calibrate", "--category", "box", "--weights", str(folder), "--frames"]
         assert cli.main([*command, "20"]) == 2
         assert "320 frames or more, got 20" in capsys.readouterr().err
         assert cli.main([*command, "640"]) == 0
         estimator = load("box", folder)
         assert estimator.card["calibration"]["frames"] == 640
+        assert estimator.card["plausibility"]["frames"] == 3 * 640
+        assert "plausibility" in estimator.variables["params"]
         assert estimator.card["calibration"]["noise"] == ["none"]  # no camera to choose
         file = tmp_path / "box.h5"
         generate = ["generate", "--category", "box", "--split", "test", "--frames", "200"]

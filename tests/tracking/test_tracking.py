@@ -253,6 +253,7 @@ def laptop_fix(root, state=0.0) -> PoseMeasurement:
         parameters=parameters,
         confidence=np.float32(1),
         rotation_log_odds=np.zeros(NUM_CUBE_ROTATIONS, np.float32),
+        reason=np.int32(0),
     )
 
 

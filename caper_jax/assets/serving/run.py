@@ -28,7 +28,8 @@ def warm_up(batch=1):  # compiles for this batch, or for the one of the model
 
 def sample(points):  # without what is no measurement, as many points as the model takes, evenly
     points = points[(np.abs(points) <= 50).all(-1) & (points != 0).any(-1)]
-    assert len(points) >= 16, f"only {len(points)} usable points"
+    distinct = len(np.unique(points, axis=0))
+    assert distinct >= 48, f"only {distinct} of {len(points)} usable points differ, 48 are needed"
     if len(points) > SHAPE[1]:  # into rows of the image, to and fro
         x, y = (points[:, :2] / np.maximum(points[:, 2:], max(points[:, 2].mean() / 2, 1e-6))).T
         x, y = ((w - w.mean()) / max(w.std(), 1e-9) * f for w, f in ((x, 8192), (y, 32 * 12**-0.5)))
@@ -40,4 +41,8 @@ if __name__ == "__main__":
     source, target = sys.argv[1:] if len(sys.argv) == 3 else sys.exit(__doc__)
     clouds = np.stack([sample(cloud) for cloud in np.array(np.load(source), np.float32, ndmin=3)])
     batches = clouds[:, None] if SHAPE[0] == 1 else clouds[None]
-    np.savez(target, **tree.map(lambda *rows: np.concatenate(rows), *map(estimate, batches)))
+    found = tree.map(lambda *rows: np.concatenate(rows), *map(estimate, batches))
+    for number in np.flatnonzero(found["reason"]):  # of the clouds that are not plausible
+        reason = MANIFEST["reasons"][found["reason"][number]]
+        print(f"warning: cloud {number}: {reason}", file=sys.stderr)
+    np.savez(target, **found)
