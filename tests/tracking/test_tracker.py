@@ -194,7 +194,7 @@ class TestShipped:
 
     def test_any_number_of_points_without_recompiling(self, player):
         player.begin(0)
-        for frame, count in enumerate((1024, 16, 700, 4000)):
+        for frame, count in enumerate((1024, 48, 700, 4000)):
             points = np.tile(player.videos.points[0, frame], (4, 1))[:count]
             _, errors = player.show(0, frame, points)
             assert errors.shape == (2,)
@@ -399,5 +399,5 @@ class TestMistakes:
         assert tracker.state is before
 
     def test_a_first_frame_without_the_object(self):
-        with pytest.raises(CaperError, match="16"):
-            toy().reset(self.POINTS[:15], EYES, OFF)
+        with pytest.raises(CaperError, match="48"):
+            toy().reset(self.POINTS[:47], EYES, OFF)

@@ -28,13 +28,15 @@ def warm_up(batch=1):  # compiles for this batch, or for the one of the model
 
 def sample(points):  # without what is no measurement, as many points as the model takes, evenly
     points = points[(np.abs(points) <= 50).all(-1) & (points != 0).any(-1)]
-    distinct = len(np.unique(points, axis=0))
-    assert distinct >= 48, f"only {distinct} of {len(points)} usable points differ, 48 are needed"
+    assert len(points) >= 48, f"only {len(points)} usable points, 48 are needed"
     if len(points) > SHAPE[1]:  # into rows of the image, to and fro
         x, y = (points[:, :2] / np.maximum(points[:, 2:], max(points[:, 2].mean() / 2, 1e-6))).T
         x, y = ((w - w.mean()) / max(w.std(), 1e-9) * f for w, f in ((x, 8192), (y, 32 * 12**-0.5)))
         points = points[np.lexsort((y % 1 * 8 // 1, np.where(y % 2 < 1, x, -x) // 1, y // 1))]
-    return points[((np.arange(SHAPE[1]) + 0.5) * len(points) / SHAPE[1]).astype(int)]
+    points = points[((np.arange(SHAPE[1]) + 0.5) * len(points) / SHAPE[1]).astype(int)]
+    distinct = len(np.unique(points, axis=0))
+    assert distinct >= 48, f"only {distinct} usable points differ, 48 are needed"
+    return points
 
 
 if __name__ == "__main__":
