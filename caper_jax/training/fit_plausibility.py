@@ -111,6 +111,8 @@ def fit_plausibility(
     ]
     unseen_features, unseen_sizes = (np.concatenate(column) for column in zip(*unseen, strict=True))
     features, classes = (np.concatenate(column) for column in zip(*samples, strict=True))
+    usable = np.isfinite(features).all(-1)  # what is not a number is implausible anyway
+    features, classes = features[usable], classes[usable]
     params = _fit(features, classes, seed)
     low, usual, high = np.quantile(unseen_sizes, [_RARE, 0.5, 1.0 - _RARE])
     bounds = [low - _MARGIN, usual, high + _MARGIN]
