@@ -46,6 +46,7 @@ _FLOOR = 1e-3
 # Logarithms of the cloud's size over the category's that a model which was not fitted takes.
 _LOW, _USUAL, _HIGH = np.log([0.35, 1.0, 2.5]).tolist()
 _FAR_OFF = 2.5
+_LARGEST = 1e4
 _GROWTH = 5.0  # largest logarithm by which implausibility widens standard deviations
 
 
@@ -98,6 +99,7 @@ class PlausibilityClassifier(Weights, nn.Module):
         # Read by ``judge``: the score that counts as zero, and (low, usual, high) of ``log_size``.
         self.param("threshold", nn.initializers.zeros, ())
         self.param("log_size", nn.initializers.zeros, (3,))
+        features = jnp.clip(features, -_LARGEST, _LARGEST)  # of what is absurd some overflow
         hidden = jnp.arcsinh((features - mean) * scale)  # logarithmic where nothing was seen
         for width in WIDTHS:
             hidden = nn.relu(Dense(width)(hidden))

@@ -185,7 +185,7 @@ def test_reasons_in_words(reason, ratio, said):
 
 
 def a_frame(name):
-    folder = demo.frame_folders()[name][0]
+    folder = demo.demo_folder() / f"{name}_0"
     depth, mask = read_depth(folder / "depth.png"), read_mask(folder / "mask.png")
     return cloud_from_depth(depth, mask, read_intrinsics(folder / "intrinsics.json")).points
 
