@@ -215,8 +215,8 @@ def test_jit_and_vmap_of_the_estimator(cabinet):
     expected = cabinet(points)
     close = partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
     jax.tree.map(close, jax.jit(jax.vmap(cabinet))(points), expected)
-    shapes = jax.eval_shape(cabinet, jnp.zeros((2, 40, 3)))
-    assert shapes.labels.shape == (2, 40)
+    shapes = jax.eval_shape(cabinet, jnp.zeros((2, 50, 3)))
+    assert shapes.labels.shape == (2, 50)
 
 
 def test_vmap_over_models_equals_one_by_one(cabinet):

@@ -15,6 +15,8 @@ from caper_jax.data.types import Dataset, Frame, NoFramesError, frame_problems, 
 from caper_jax.errors import CaperError
 from caper_jax.progress import progress
 
+_FEWEST_OF_PART = 16  # points, below which they say nothing about a part's box
+
 _FIELDS = ("points", "labels", "visible", "visibility", *pose_shapes(2))
 # Points of a part may lie off its box by this share of the object's diagonal (sensors, masks), and
 # half of them further: a label, pose or camera of another image misses by more.
@@ -165,7 +167,7 @@ def _misplaced(frame: Frame, category: Category) -> list[str]:
     phrases = []
     for part, name in enumerate(category.parts):
         points = frame.points[labels == part]
-        if len(points) < MIN_POINTS:
+        if len(points) < _FEWEST_OF_PART:
             continue
         local = (points - truth.translation[part]) @ truth.rotation[part]
         excess = np.abs(local - truth.box_center[part]) - truth.size[part] / 2

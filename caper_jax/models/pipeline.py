@@ -11,6 +11,7 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from caper_jax.articulation.category import Category
@@ -30,6 +31,9 @@ from caper_jax.models.rotation_classes import rotate_pose, select_rotation
 
 # Part sizes are residuals to a mean; nothing else keeps a regression from going below zero.
 SMALLEST_SIZE = 0.01  # of the mean
+# Clouds that are no object make networks say anything: beyond so many mean sizes, and ranges of
+# joints, numbers only overflow.
+_ABSURD = 100.0
 
 
 @flax.struct.dataclass
@@ -92,15 +96,17 @@ def run_stages(
     parts = apply("parts", parts_network, canonical)
     axis, pivot = vote(canonical, parts.heatmap, parts.offset, parts.direction)
     mean_size = jnp.asarray(category.mean_size, cloud.dtype) * unit
+    widest = jnp.asarray(np.abs(category.state_bounds).max(-1) * category.state_units, cloud.dtype)
     moved = se3.log(se3.compose(se3.inverse(unrefined), pose))
     return StageOutputs(
         estimate=StageEstimate(
             root=pose,
             axis=axis,
             pivot=pivot,
-            state=parts.state,
-            size=jnp.maximum(mean_size + parts.size, SMALLEST_SIZE * mean_size),
-            center=jnp.asarray(category.mean_center, cloud.dtype) * unit + parts.center,
+            state=jnp.clip(parts.state, -_ABSURD * widest, _ABSURD * widest),
+            size=jnp.clip(mean_size + parts.size, SMALLEST_SIZE * mean_size, _ABSURD * mean_size),
+            center=jnp.asarray(category.mean_center, cloud.dtype) * unit
+            + jnp.clip(parts.center, -_ABSURD * mean_size, _ABSURD * mean_size),
         ),
         segmentation=parts.segmentation,
         confidence=root.confidence,

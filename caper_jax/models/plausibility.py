@@ -8,6 +8,7 @@ paper.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 import flax.linen as nn
@@ -45,7 +46,7 @@ _NEAR = (0.02, 0.05)  # distances, in diagonals
 _FLOOR = 1e-3
 # Logarithms of the cloud's size over the category's that a model which was not fitted takes.
 _LOW, _USUAL, _HIGH = np.log([0.35, 1.0, 2.5]).tolist()
-_FAR_OFF = 2.5
+_FAR_OFF = 2.5  # times the usual size
 _LARGEST = 1e4
 _GROWTH = 5.0  # largest logarithm by which implausibility widens standard deviations
 
@@ -138,7 +139,7 @@ def box_fit(
     from_own, from_any = (share * surface).sum(-1), surface.min(-1)
     spreads = []
     for distance in (of_own, from_own, of_any, from_any):
-        spreads += [distance.mean(-1), jnp.sqrt(jnp.square(distance).mean(-1))]
+        spreads += [distance.mean(-1), jnp.sqrt(jnp.square(distance).mean(-1) + 1e-12)]
     shares = [
         (distance > near * diagonal).mean(-1)
         for near in _NEAR
@@ -269,7 +270,7 @@ def rules(reason, log_size, distinct, number: int, params: dict[str, Any] | None
     """
     low, usual, high = size_bounds(params)
     # Of what is not plausible anyway, a size that is far off is the likeliest cause.
-    wrong, far = reason != PLAUSIBLE, np.log(_FAR_OFF)
+    wrong, far = reason != PLAUSIBLE, math.log(_FAR_OFF)
     reason = jnp.where((log_size > high) | (wrong & (log_size > usual + far)), TOO_LARGE, reason)
     reason = jnp.where((log_size < low) | (wrong & (log_size < usual - far)), TOO_SMALL, reason)
     return jnp.where(distinct < min(DOUBTFUL_POINTS, number // 2), FEW_POINTS, reason)

@@ -190,7 +190,7 @@ def predict(estimator: Estimator, clouds: np.ndarray) -> Any:
     count = len(clouds)
     padded = np.resize(clouds, (-(-count // BATCH) * BATCH, *clouds.shape[1:]))
     parts = [
-        jax.device_get(estimator(padded[start : start + BATCH]))
+        jax.device_get(estimator._jitted(estimator.variables, padded[start : start + BATCH]))
         for start in range(0, len(padded), BATCH)
     ]
     return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:count], *parts)

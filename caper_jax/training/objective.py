@@ -28,9 +28,9 @@ from caper_jax.geometry.frames import (
     transpose,
     view_rotation,
 )
+from caper_jax.geometry.raster_order import raster_order, to_raster_order
 from caper_jax.geometry.two_axis_rotation import rotation_from_directions
 from caper_jax.lie import se3, so3
-from caper_jax.models.observation import observe
 from caper_jax.models.parts import (
     PartsNetwork,
     PartsOutput,
@@ -242,22 +242,23 @@ class Objective:
         self, params: PyTree, model_state: PyTree, batch: Any, key: Array
     ) -> tuple[Scalar, RootResult]:
         """Eq 22 on one batch, and what stage II needs; ``params`` are stage I's own."""
-        observed = observe(batch.points, self.category)
-        points = observed.selection.pick(batch.points)
-        labels = observed.selection.pick(batch.labels[..., None])[..., 0]
-        batch = replace(batch, points=points, labels=labels)
-        view, cloud = observed.view, observed.cloud
-        visible = cloud
+        order = raster_order(batch.points)
+        batch = replace(
+            batch,
+            points=to_raster_order(batch.points, order),
+            labels=to_raster_order(batch.labels[..., None], order)[..., 0],
+        )
+        visible = batch.points
         if self.config.root_input == "root":
-            own = part_points(points, labels == 0)
-            view = view_rotation(own, self.category.viewpoint.camera_roll)
-            visible, cloud = (rotate(view, one) * self.category.unit for one in (own, points))
+            visible = part_points(batch.points, batch.labels == 0)
+        view = view_rotation(visible, self.category.viewpoint.camera_roll)
+        unit = self.category.unit
         outputs, new_state = self._apply(
-            "root", params, model_state, visible, jax.random.split(key, 4)[0]
+            "root", params, model_state, rotate(view, visible) * unit, jax.random.split(key, 4)[0]
         )
         truth, labels, terms = self._nearest_symmetry(outputs, batch, view)
         result = RootResult(
-            points=cloud,
+            points=rotate(view, batch.points) * unit,
             labels=labels,
             truth=truth,
             outputs=outputs,

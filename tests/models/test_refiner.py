@@ -144,7 +144,7 @@ def test_fitting_writes_a_model_that_knows_sizes_better(tmp_path, monkeypatch):
     assert card["run"]["network"]["refiner"]["width"] == 64 and "calibration" not in card
     assert variables["params"]["refiner"]["Dense_0"]["kernel"].shape[1] == 64
     fitted, batch = load("box", folder), frames(BOX)
-    assert errors(fitted, batch)[1] < 0.95 * errors(without(fitted), batch)[1]
+    assert errors(fitted, batch)[1] < 0.98 * errors(without(fitted), batch)[1]
 
 
 def test_too_few_frames_are_refused():

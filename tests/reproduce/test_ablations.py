@@ -193,11 +193,11 @@ def test_stage_one_sees_the_root_alone_where_there_is_enough_of_it():
 
     points = np.random.default_rng(0).uniform(0.5, 1.0, (100, 3)).astype(np.float32)
     few, many = np.ones(100, int), np.ones(100, int)
-    few[:10], many[:40] = 0, 0
+    few[:10], many[:60] = 0, 0
     frames = [SimpleNamespace(name="f", points=points, labels=labels) for labels in (few, many)]
     root_pose.root_predictor(estimator)(frames, np.stack([points[:64], points[:64]]))
     np.testing.assert_array_equal(shown[0][0], points[:64])
-    assert set(map(tuple, shown[0][1])) <= set(map(tuple, points[:40]))
+    assert set(map(tuple, shown[0][1])) <= set(map(tuple, points[:60]))
     frames[0].labels = None
     with pytest.raises(CaperError, match="'f'"):
         root_pose.root_predictor(estimator)(frames, np.stack([points[:64]] * 2))

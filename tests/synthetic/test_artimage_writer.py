@@ -20,7 +20,7 @@ from caper_jax.synthetic.artimage_writer import LayoutWriter
 from caper_jax.synthetic.images import Image
 from caper_jax.synthetic.instances import draw_instances
 
-SIZE = 64
+SIZE = 96
 PM_VIDEOS = ["--layout", "pm-videos", "--videos", "2"]
 CAMERA = np.array([[91.4, 0.0, 31.5], [0.0, 90.0, 32.5], [0.0, 0.0, 1.0]])
 NAMES = [name for name in categories.names() if categories.get(name).shape is not None]
