@@ -20,7 +20,7 @@ from caper_jax.synthetic.artimage_writer import LayoutWriter
 from caper_jax.synthetic.images import Image
 from caper_jax.synthetic.instances import draw_instances
 
-SIZE = 96
+SIZE, RENDERED = 64, 128
 PM_VIDEOS = ["--layout", "pm-videos", "--videos", "2"]
 CAMERA = np.array([[91.4, 0.0, 31.5], [0.0, 90.0, 32.5], [0.0, 0.0, 1.0]])
 NAMES = [name for name in categories.names() if categories.get(name).shape is not None]
@@ -101,8 +101,8 @@ def test_every_category_reads_back(tmp_path, name):
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setattr(generate, "SIZE", SIZE)
-    monkeypatch.setattr(generate, "FOCAL", 91.4)
+    monkeypatch.setattr(generate, "SIZE", RENDERED)
+    monkeypatch.setattr(generate, "FOCAL", 182.8)
 
 
 def run(out, *arguments):
@@ -129,7 +129,7 @@ def test_rendered_images_as_of_artimage(tmp_path, small):
         assert_whole(frame)
         assert (frame.depth[~frame.mask] == 0).all()
     with Picture.open(tmp_path / "laptop/train/color/000000.jpg") as color:
-        assert color.size == (SIZE, SIZE)
+        assert color.size == (RENDERED, RENDERED)
     with pytest.raises(CaperError, match=r"test\.txt: lists frames already"):
         run(tmp_path, "--layout", "artimage", "--frames", "1")
 
