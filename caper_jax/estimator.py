@@ -154,7 +154,7 @@ def estimate(
     if verdict.score is not None:
         wider = widening(verdict.score)[:, None]
         rotation, translation = jnp.minimum(rotation * wider, np.pi), translation * wider
-        low, high = (category.state_bounds * category.state_units[:, None]).T.astype(state.dtype)
+        low, high = category.network_state_bounds.T.astype(state.dtype)
         state = jnp.minimum(state * wider, high - low)
     state_units = jnp.asarray(category.state_units, state.dtype)
     return prediction.replace(  # type: ignore[attr-defined]

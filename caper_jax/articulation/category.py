@@ -165,6 +165,11 @@ class Category:
         margin = _BEYOND_LIMITS * (limits[:, 1] - limits[:, 0])
         return limits + np.stack([-margin, margin], axis=-1)
 
+    @property
+    def network_state_bounds(self) -> np.ndarray:
+        """[K-1, 2] ``state_bounds`` in radians or network units."""
+        return self.state_bounds * self.state_units[:, None]
+
     def scaled(self, factor: float) -> Category:
         """The category of objects that are ``factor`` times as large; same networks, same weights.
 

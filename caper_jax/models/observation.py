@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import flax.struct
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Integer, Shaped
+from jaxtyping import Array, Float, Integer, Shaped
 
 from caper_jax.articulation.category import Category
 from caper_jax.geometry.frames import rotate, view_rotation
@@ -24,22 +24,15 @@ class Selection:
     order: Integer[Array, "B N"]
     inliers: Inliers
 
-    @property
-    def kept(self) -> Bool[Array, "B N"]:
-        """Which of the points that came belong to the object."""
-        return from_raster_order(self.inliers.kept[..., None], self.order)[..., 0]
-
     def pick(self, values: Shaped[Array, "B N C"]) -> Shaped[Array, "B N C"]:
         """Rows of the selection, from rows for the points that came."""
         return self.inliers.apply(to_raster_order(values, self.order))
 
-    def spread(self, values: Shaped[Array, "B N C"]) -> Shaped[Array, "B N C"]:
-        """Rows for the points that came, from rows of the selection."""
-        return from_raster_order(self.inliers.undo(values), self.order)
-
     def spread_labels(self, labels: Integer[Array, "B N"]) -> Integer[Array, "B N"]:
         """Labels of the points that came, from those of the selection; -1 for strays."""
-        return jnp.where(self.kept, self.spread(labels[..., None])[..., 0], -1)
+        own = self.inliers.undo(labels[..., None])
+        own = jnp.where(self.inliers.kept[..., None], own, -1)
+        return from_raster_order(own, self.order)[..., 0]
 
 
 def select(points: Float[Array, "B N 3"]) -> Selection:

@@ -63,7 +63,7 @@ def run_stages(
 
     Args:
       variables: see ``estimator.estimate``.
-      cloud: viewing frame, network units, raster order (``observation.Observation.cloud``).
+      cloud: viewing frame, network units, raster order (``observation.ObservedCloud.cloud``).
       category, network: static.
     """
 
@@ -96,7 +96,7 @@ def run_stages(
     parts = apply("parts", parts_network, canonical)
     axis, pivot = vote(canonical, parts.heatmap, parts.offset, parts.direction)
     mean_size = jnp.asarray(category.mean_size, cloud.dtype) * unit
-    widest = jnp.asarray(np.abs(category.state_bounds).max(-1) * category.state_units, cloud.dtype)
+    widest = jnp.asarray(np.abs(category.network_state_bounds).max(-1), cloud.dtype)
     moved = se3.log(se3.compose(se3.inverse(unrefined), pose))
     return StageOutputs(
         estimate=StageEstimate(

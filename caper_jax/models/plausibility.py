@@ -19,12 +19,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from caper_jax.articulation.category import Category
-from caper_jax.articulation.kinematics import forward_kinematics
 from caper_jax.geometry.boxes import rest_diagonal
 from caper_jax.lie import linalg
 from caper_jax.models.layers import Dense, Weights
 from caper_jax.models.observation import ObservedCloud
-from caper_jax.models.refiner import StageEstimate
+from caper_jax.models.refiner import StageEstimate, points_from_centers
 
 # What ``Prediction.reason`` counts; the classifier's classes are those from PLAUSIBLE to PART.
 PLAUSIBLE, SIZE, OTHER, SEVERAL, PART, FEW_POINTS, TOO_LARGE, TOO_SMALL = range(8)
@@ -157,7 +156,7 @@ def box_fit(
     inliers = observed.selection.inliers
     strays = 1.0 - inliers.kept.mean(-1)
     distinct = jnp.log(inliers.distinct / number)
-    low, high = (category.state_bounds * category.state_units[:, None]).T.astype(cloud.dtype)
+    low, high = category.network_state_bounds.T.astype(cloud.dtype)
     features = (
         jnp.log(jnp.stack(spreads, -1) / diagonal + _FLOOR),
         jnp.stack(shares, -1),
@@ -214,16 +213,7 @@ def _radii(cloud: Float[Array, "B N 3"]) -> tuple[Float[Array, "B N 3"], Float[A
 def _distances(estimate: StageEstimate, cloud: Float[Array, "B N 3"], category: Category):
     """Points in each part's frame from its box's center [B, N, K, 3], and their distances [B, N, K]
     outside the box and from its surface."""
-    parts = forward_kinematics(
-        estimate.root,
-        estimate.axis,
-        estimate.pivot,
-        estimate.state,
-        category.joint_types,
-        category.parents,
-    )
-    away = cloud[:, :, None] - parts[:, None, :, :3, 3]
-    own = (away[..., :, None] * parts[:, None, :, :3, :3]).sum(-2) - estimate.center[:, None]
+    own = points_from_centers(estimate, cloud, category)
     over = jnp.abs(own) - estimate.size[:, None] / 2
     outside = linalg.norm(jnp.maximum(over, 0.0))
     return own, outside, outside - jnp.minimum(over.max(-1), 0.0)

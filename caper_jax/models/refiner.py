@@ -126,17 +126,8 @@ def refiner_features(
       category: static.
     """
     batch = cloud.shape[0]
-    parts = forward_kinematics(
-        estimate.root,
-        estimate.axis,
-        estimate.pivot,
-        estimate.state,
-        category.joint_types,
-        category.parents,
-    )
-    away = cloud[:, :, None] - parts[:, None, :, :3, 3]
-    own = (away[..., :, None] * parts[:, None, :, :3, :3]).sum(-2)  # R^T (p - t)
-    inside = (own - estimate.center[:, None]) / (0.5 * estimate.size[:, None])  # [B, N, K, 3]
+    own = points_from_centers(estimate, cloud, category)
+    inside = own / (0.5 * estimate.size[:, None])  # [B, N, K, 3]
 
     count = share.sum(1)  # [B, K]
     weight = share / (share.sum(1, keepdims=True) + 1.0)
@@ -150,6 +141,23 @@ def refiner_features(
     box = (jnp.log(estimate.size / mean_size), estimate.center / mean_size)
     features = (*of_points, *box, estimate.state, evidence)
     return jnp.concatenate([values.reshape(batch, -1) for values in features], axis=-1)
+
+
+def points_from_centers(
+    estimate: StageEstimate, cloud: Float[Array, "B N 3"], category: Category
+) -> Float[Array, "B N K 3"]:
+    """Every point in the frame of every part, from the center of its box; network units."""
+    parts = forward_kinematics(
+        estimate.root,
+        estimate.axis,
+        estimate.pivot,
+        estimate.state,
+        category.joint_types,
+        category.parents,
+    )
+    away = cloud[:, :, None] - parts[:, None, :, :3, 3]
+    own = (away[..., :, None] * parts[:, None, :, :3, :3]).sum(-2)  # R^T (p - t)
+    return own - estimate.center[:, None]
 
 
 def _tilt(inside, share, side: float):

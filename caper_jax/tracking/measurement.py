@@ -102,7 +102,7 @@ def measure(
         known=jnp.zeros(category.num_joints),
     )
     tree = JointTree(axis[0], pivot[0], category.joint_types, category.parents)
-    low, high = (category.state_bounds * category.state_units[:, None]).T.astype(points.dtype)
+    low, high = category.network_state_bounds.T.astype(points.dtype)
     state = jnp.clip(output.state[0], low, high)
     measurement = PoseMeasurement(
         root=se3.compose(reference, increment),

@@ -361,7 +361,7 @@ def _track_step(
 
 def _bounded(joints, begun, category: Category):
     """Joint states [J] within ``Category.state_bounds``, or as far beyond as the keyframe's."""
-    low, high = (category.state_bounds * category.state_units[:, None]).T.astype(joints.dtype)
+    low, high = category.network_state_bounds.T.astype(joints.dtype)
     return jnp.clip(joints, jnp.minimum(low, begun), jnp.maximum(high, begun))
 
 
