@@ -215,8 +215,8 @@ class Estimator:
           Prediction with the leading axes of ``points``.
 
         Raises:
-          CaperError: wrong shape or dtype, fewer than 48 usable points that
-            differ, or points in millimeters.
+          CaperError: wrong shape or dtype, fewer than 48 usable points that differ, or points in
+            millimeters.
         """
         if isinstance(points, jax.core.Tracer):
             _check_shape(points.shape)

@@ -22,9 +22,8 @@ class Calibrate:
 
     Standard deviations (rotation_std, translation_std, state_std) and the classifier that tells
     right objects from wrong ones are fitted on generated frames of instances that training never
-    shows. With --refiner the network that corrects the
-    model's estimates by the sides of their boxes is fitted first. Training on generated frames
-    does both at its end.
+    shows. With --refiner the network that corrects the model's estimates by the sides of their
+    boxes is fitted first. Training on generated frames does both at its end.
 
     Attributes:
       category: e.g. box, or FILE.py:NAME for one of your own
@@ -53,11 +52,10 @@ def parse(argv: Sequence[str]) -> Calibrate:
 def run(options: Calibrate) -> int:
     """Runs the command; returns its exit code."""
     from caper_jax.config import TRAINING_DATA
-    from caper_jax.estimator import load
-    from caper_jax.models.files import CARD_FILE, write_card
+    from caper_jax.models.files import CARD_FILE
     from caper_jax.training import fit_refiner
-    from caper_jax.training.fit_plausibility import FRAMES_PER_CALIBRATED, add_plausibility
-    from caper_jax.training.fit_uncertainty import calibrate, check_frame_count
+    from caper_jax.training.fit_plausibility import add_calibration
+    from caper_jax.training.fit_uncertainty import check_frame_count
 
     weights, category = options.weights, options.category
     check_frame_count(options.frames)  # before anything is written
@@ -65,11 +63,6 @@ def run(options: Calibrate) -> int:
         fit_refiner.add_refiner(
             weights, category, TRAINING_DATA, frames=options.refiner_frames, seed=options.seed
         )
-    add_plausibility(
-        weights, category, TRAINING_DATA, FRAMES_PER_CALIBRATED * options.frames, options.seed
-    )
-    estimator = load(category, weights)
-    section = calibrate(estimator, TRAINING_DATA, options.frames, options.seed)
-    write_card(weights, {**estimator.card, "calibration": section})
+    add_calibration(weights, category, TRAINING_DATA, options.frames, options.seed)
     print(f"written: {weights / CARD_FILE} (calibrated on {options.frames} frames)")
     return 0

@@ -32,8 +32,8 @@ A record is one object of one frame and complete in itself:
 
 ``estimate`` adds confidence (of the root's two directions, 0 to 1), plausibility (0 to 1, absent
 where the model has no classifier) and points (of the cloud: available, dropped). ``track`` adds
-energy, keyframe, estimated, lost and milliseconds; the live
-stream also skipped, the frames left out before this one.
+energy, keyframe, estimated, lost and milliseconds; the live stream also skipped, the frames left
+out before this one.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from caper_jax.data.loader import Loader
 from caper_jax.data.readers import open_dataset
 from caper_jax.data.types import Batch
 from caper_jax.errors import CaperError
-from caper_jax.estimator import load, network_of
+from caper_jax.estimator import network_of
 from caper_jax.models.files import (
     CARD_FILE,
     WEIGHTS_FILE,
@@ -43,8 +43,7 @@ from caper_jax.models.files import (
 )
 from caper_jax.synthetic.frames import Generator
 from caper_jax.training import fit_refiner, parallel
-from caper_jax.training.fit_plausibility import FRAMES_PER_CALIBRATED, add_plausibility
-from caper_jax.training.fit_uncertainty import calibrate
+from caper_jax.training.fit_plausibility import add_calibration
 from caper_jax.training.loop import FitResult, fit
 from caper_jax.training.objective import Objective
 from caper_jax.training.run_directory import CONFIG_FILE, STARTED_FROM
@@ -181,11 +180,7 @@ def _finish(config: RunConfig, category: str | Category, directory: str | Path) 
         except fit_refiner.UnreliableModel as error:  # a short run: usable as it is
             print(f"the refiner is not fitted: {error}", file=sys.stderr)
     if config.calibration_frames:
-        frames = FRAMES_PER_CALIBRATED * config.calibration_frames
-        add_plausibility(directory, category, config.data, frames, seed)
-        estimator = load(category, directory)
-        calibration = calibrate(estimator, config.data, config.calibration_frames, seed)
-        write_card(directory, {**estimator.card, "calibration": calibration})
+        add_calibration(directory, category, config.data, config.calibration_frames, seed)
 
 
 def _fit_generated(
