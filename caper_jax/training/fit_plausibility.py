@@ -48,6 +48,7 @@ from caper_jax.training.fit_uncertainty import (
     mixed_frames,
     sensors_alone,
 )
+from caper_jax.training.small_fits import minimize
 
 FRAMES = 12_288  # of right objects, and about as many wrong ones
 _PER_CALIBRATED = 3  # frames, for each that standard deviations are fitted on
@@ -335,34 +336,26 @@ def _fit(features: np.ndarray, classes: np.ndarray, seed: int) -> Any:
     weights = {**_WEIGHTS, PLAUSIBLE: sum(_WEIGHTS.values())}
     chance = np.array([weights[kind] / (classes == kind).sum() for kind in classes.tolist()])
     edges = jnp.asarray(np.cumsum(chance / chance.sum()), jnp.float32)
-    schedule = optax.cosine_decay_schedule(_RATE, _STEPS)
-    optimizer = optax.adamw(schedule, weight_decay=_DECAY)
     deviation = _NOISE / fixed["scale"]
 
-    def loss(free, drawn, kinds):
+    def loss(free, data, key):
+        draw, shake = jax.random.split(key)
+        index = jnp.searchsorted(edges, jax.random.uniform(draw, (_DRAWN,)))
+        index = jnp.minimum(index, len(edges) - 1)
+        drawn, kinds = jax.tree.map(lambda values: values[index], data)
+        drawn += deviation * jax.random.normal(shake, drawn.shape)
         logits: Any = module.apply({"params": free | fixed}, drawn)
         return optax.softmax_cross_entropy_with_integer_labels(logits, kinds).mean()
 
-    @jax.jit
-    def several(carry, steps, data):
-        def one(carry, key):
-            free, state = carry
-            draw, shake = jax.random.split(key)
-            index = jnp.searchsorted(edges, jax.random.uniform(draw, (_DRAWN,)))
-            index = jnp.minimum(index, len(edges) - 1)
-            drawn, kinds = jax.tree.map(lambda values: values[index], data)
-            drawn += deviation * jax.random.normal(shake, drawn.shape)
-            value, gradient = jax.value_and_grad(loss)(free, drawn, kinds)
-            update, state = optimizer.update(gradient, state, free)
-            return (optax.apply_updates(free, update), state), value
-
-        return jax.lax.scan(one, carry, steps)
-
-    data = jax.device_put((features, classes.astype(np.int32)))
-    carry = free, optimizer.init(free)
-    with progress("fitting the classifier", total=_STEPS) as bar:
-        for number in range(_STEPS // _PER_CALL):
-            own = jax.random.split(jax.random.fold_in(keys[1], number), _PER_CALL)
-            carry, values = several(carry, own, data)
-            bar.update(_PER_CALL, loss=float(values.mean()))
-    return carry[0] | fixed
+    free = minimize(
+        loss,
+        free,
+        (features, classes.astype(np.int32)),
+        keys[1],
+        calls=_STEPS // _PER_CALL,
+        per_call=_PER_CALL,
+        rate=_RATE,
+        decay=_DECAY,
+        title="fitting the classifier",
+    )
+    return free | fixed

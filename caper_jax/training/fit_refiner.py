@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
@@ -32,8 +31,8 @@ from caper_jax.models.pipeline import (
     run_stages,
 )
 from caper_jax.models.refiner import BoxRefiner, RefinerOutput
-from caper_jax.progress import progress
 from caper_jax.training.fit_uncertainty import mixed_frames, nearer_symmetry, sensors_alone
+from caper_jax.training.small_fits import minimize
 
 FRAMES = 40_000
 _SPLIT = "train"
@@ -189,37 +188,29 @@ def _fit(features: np.ndarray, off: RefinerOutput, width: int, num_parts: int, s
     scale = 1.0 / (deviation + 0.02)  # what never varies stays small
     params |= {"mean": jnp.asarray(mean), "scale": jnp.asarray(scale)}
     calls = max(_STEPS, _EPOCHS * len(features) // _BATCH) // _PER_CALL
-    schedule = optax.cosine_decay_schedule(_RATE, calls * _PER_CALL)
-    optimizer = optax.adamw(schedule, weight_decay=_DECAY)
 
-    def loss(free, chosen, right, key):
-        kept = jax.random.bernoulli(key, 1 - _DROPOUT, chosen.shape)
+    def loss(free, data, key):
+        draw, drop = jax.random.split(key)
+        index = jax.random.randint(draw, (_BATCH,), 0, len(features))
+        chosen, right = jax.tree.map(lambda values: values[index], data)
+        kept = jax.random.bernoulli(drop, 1 - _DROPOUT, chosen.shape)
         chosen = jnp.where(kept, chosen, mean)
         output = module.apply({"params": params | free}, chosen)
         errors = jax.tree.map(lambda o, r: jnp.abs(o - r).mean(), output, right)
         return sum(jax.tree.leaves(jax.tree.map(jnp.multiply, _WEIGHTS, errors)))
 
-    @jax.jit
-    def several(carry, steps, data):
-        def one(carry, key):
-            free, state = carry
-            draw, drop = jax.random.split(key)
-            index = jax.random.randint(draw, (_BATCH,), 0, len(features))
-            chosen, right = jax.tree.map(lambda values: values[index], data)
-            value, gradient = jax.value_and_grad(loss)(free, chosen, right, drop)
-            update, state = optimizer.update(gradient, state, free)
-            return (optax.apply_updates(free, update), state), value
-
-        return jax.lax.scan(one, carry, steps)
-
-    data = jax.device_put((features, off))
     free = {name: value for name, value in params.items() if name not in ("mean", "scale")}
-    carry = free, optimizer.init(free)
-    with progress("fitting the refiner", total=calls * _PER_CALL) as bar:
-        for number in range(calls):
-            own = jax.random.split(jax.random.fold_in(keys[1], number), _PER_CALL)
-            carry, values = several(carry, own, data)
-            bar.update(_PER_CALL, loss=float(values.mean()))
+    free = minimize(
+        loss,
+        free,
+        (features, off),
+        keys[1],
+        calls=calls,
+        per_call=_PER_CALL,
+        rate=_RATE,
+        decay=_DECAY,
+        title="fitting the refiner",
+    )
     # Rounded to bfloat16, which costs nothing that can be measured: files become smaller.
-    short = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16).astype(jnp.float32), carry[0])
+    short = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16).astype(jnp.float32), free)
     return jax.device_get(params | short)
