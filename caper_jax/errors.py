@@ -33,6 +33,8 @@ def describe_problem(error: Any) -> str:
       error: as raised by ``validate_python`` or ``validate_json``.
     """
     problem = error.errors()[0]
+    if isinstance(known := problem.get("ctx", {}).get("error"), CaperError):
+        return str(known)  # names its fields itself
     # Of alternatives such as ``int | str``, pydantic adds the type that it tried.
     names = [str(name) for name in problem["loc"] if not _TYPE.fullmatch(str(name))]
     key, value = ".".join(names) or "the content", problem["input"]
@@ -41,8 +43,8 @@ def describe_problem(error: Any) -> str:
     if problem["type"] == "missing":
         return f"{key} is missing"
     if problem["type"] == "literal_error" and isinstance(value, str):
-        known = problem["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", ")
-        return str(unknown_name(key, value, known))
+        names = problem["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", ")
+        return str(unknown_name(key, value, names))
     message = re.sub(r"^(Input|List|Tuple|String|Dictionary) should", "must", problem["msg"])
     message = (
         message.replace("greater than or equal to", "at least")
