@@ -29,6 +29,7 @@ Size = Annotated[int, Ge(0)]
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 Fraction = Annotated[float, Ge(0), Le(1)]
+Seed = Annotated[int, Ge(0), Lt(2**32)]
 
 SensorName = Literal["none", "gauss3mm", "kinect", "realsense"]
 OccluderName = Literal["edge", "strip", "blob"]
@@ -80,6 +81,9 @@ class FastEncoderConfig:
       centers: points that get local moments in training; evenly over the cloud.
       eval_centers: the same when a trained model is used: with more of them the same weights
         are more accurate.
+      center_order: "scan", the centers follow the raster order of the cloud, in which any even pick
+        is spread evenly over the image, or "random", they are at fixed random places of it
+        (ablation).
       stride: the moments are taken over every stride-th point.
       scales: standard deviations of the Gaussian windows, relative to the cloud's radius.
       width: features per center.
@@ -90,6 +94,7 @@ class FastEncoderConfig:
 
     centers: Count = 128
     eval_centers: Count = 256
+    center_order: Literal["scan", "random"] = "scan"
     stride: Count = 1
     scales: Annotated[tuple[Annotated[float, Ge(1e-3)], ...], MinLen(1)] = (0.1, 0.2, 0.4)
     width: Count = 128
@@ -335,6 +340,7 @@ class LossConfig:
     Attributes:
       weights: of Eqs 22 and 23.
       heatmap: form of Eq 5: "exponential" (as printed), "scaled" or "linear".
+      heatmap_gate: share of the farthest point's distance beyond which points do not vote (Eq 5).
       state_penalty: alpha of Eq 20.
       root_noise_deg: stage II sees clouds canonicalized with a root pose that is off by a rotation
         with this standard deviation about each axis...
@@ -353,6 +359,7 @@ class LossConfig:
 
     weights: LossWeights = LossWeights()
     heatmap: HeatmapKind = "exponential"
+    heatmap_gate: Annotated[float, Gt(0), Le(1)] = 0.2
     state_penalty: NonNegative = 20.0
     root_noise_deg: NonNegative = 4.0
     root_noise: NonNegative = 0.03
@@ -368,8 +375,9 @@ def _as_pytree(cls: type, static: tuple[str, ...] = ()) -> None:
     jax.tree_util.register_dataclass(cls, data_fields=traced, meta_fields=list(static))
 
 
+STATIC_LOSS = ("heatmap", "root_input")  # settings of the loss that are no numbers
 _as_pytree(LossWeights)
-_as_pytree(LossConfig, ("heatmap", "root_input"))
+_as_pytree(LossConfig, STATIC_LOSS)
 
 
 @section
@@ -388,6 +396,8 @@ class TrainingConfig:
       minutes: length of the run in minutes of training, summed over resumes; compiling the step
         does not count.
       seed: every random number of the run follows from it.
+      data_seed: shapes and frames follow from this one instead, so that runs with other seeds see
+        the same data in the same order; None for ``seed``.
       steps_per_dispatch: steps compiled into one call, to hide the cost of calling.
       log_steps: steps averaged into one line of metrics.jsonl.
       checkpoint_minutes: time between checkpoints.
@@ -410,7 +420,8 @@ class TrainingConfig:
     weight_decay: NonNegative = 0.0
     steps: Count | None = None
     minutes: Positive | None = None
-    seed: Annotated[int, Ge(0), Lt(2**32)] = 0
+    seed: Seed = 0
+    data_seed: Seed | None = None
     steps_per_dispatch: Count = 1
     log_steps: Count = 50
     checkpoint_minutes: Positive = 5.0
@@ -426,6 +437,11 @@ class TrainingConfig:
                 f"training needs either steps or minutes, got steps={self.steps}, "
                 f"minutes={self.minutes}"
             )
+
+    @property
+    def stream(self) -> int:
+        """Seed of shapes and frames."""
+        return self.seed if self.data_seed is None else self.data_seed
 
 
 # Every sensor, and a little of everything that masks and cameras do wrong: what a network must bear
@@ -637,11 +653,32 @@ FAST = RunConfig(
         optimizer="adamw", learning_rate=2e-3, warmup=200, weight_decay=1e-4, minutes=60.0
     ),
 )
-PRESETS = {"paper": PAPER, "fast": FAST}
+# Many trainings side by side: the fast preset with a quarter of the points and half the width.
+ABLATION = replace(
+    FAST,
+    network=replace(
+        FAST.network,
+        fast=FastEncoderConfig(centers=64, eval_centers=128, width=64, last=192),
+        root_heads=replace(FAST.network.root_heads, widths=(128, 128, 128)),
+        pooled_heads=replace(FAST.network.pooled_heads, widths=(128, 128, 128)),
+        point_heads=replace(FAST.network.point_heads, widths=(32, 32, 32)),
+        rotation_classifier=RotationClassifierConfig(width=32),
+        refiner=RefinerConfig(),
+        num_points=256,
+    ),
+    data=replace(TRAINING_DATA, instances=1000, grid=32, num_points=256),
+    training=replace(FAST.training, steps=3000, minutes=None, warmup=100),
+    calibration_frames=0,
+)
+PRESETS = {"paper": PAPER, "fast": FAST, "ablation": ABLATION}
 
 
 def preset(name: str, category: str = "") -> RunConfig:
-    """The run of a preset: "paper" as published, "fast" for two CPU cores.
+    """The run of a preset.
+
+    Args:
+      name: "paper" as published, "fast" for two CPU cores, "ablation" for many runs on them.
+      category: its name.
 
     Raises:
       CaperError: unknown name.
@@ -683,14 +720,37 @@ def update(config: T, path: str | Path) -> T:
     Raises:
       CaperError: the file cannot be read, or holds an unknown key or a wrong value.
     """
-    values = to_dict(config)
+    return merge(config, read_toml(path), str(path))
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """The content of a TOML file.
+
+    Raises:
+      CaperError: the file cannot be read, or is not TOML.
+    """
     try:
-        _merge(values, tomllib.loads(Path(path).read_text(encoding="utf-8")), type(config))
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise CaperError(f"cannot read configuration {path}: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CaperError(f"{path} is not valid TOML: {error}") from error
-    return from_dict(type(config), values, str(path))
+
+
+def merge(config: T, changes: dict[str, Any], where: str = "") -> T:
+    """A copy of a configuration with nested plain values in the place of its own.
+
+    Args:
+      config: a section.
+      changes: {"training": {"steps": 100}} and the like.
+      where: the file or argument the values come from, for error messages.
+
+    Raises:
+      CaperError: an unknown key or a wrong value.
+    """
+    values = to_dict(config)
+    _merge(values, changes, type(config))
+    return from_dict(type(config), values, where)
 
 
 def check(config: T) -> T:

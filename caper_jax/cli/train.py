@@ -50,7 +50,7 @@ class Train:
       category: e.g. box, or FILE.py:NAME for one of your own; several with commas, or all, one
         after the other, each into a folder of its own in --out
       out: folder of the run
-      preset: fast or paper (default: fast; with --from the network of that model)
+      preset: fast, paper or ablation (default: fast; with --from the network of that model)
       config: TOML file of settings over the preset's
       initial: start from the weights of this model, or of the one that ships for a category,
         instead of random ones; one of another category gives its encoders; a folder of models
@@ -71,7 +71,7 @@ class Train:
 
     category: tuple[str, ...]
     out: Path
-    preset: Literal["fast", "paper"] | None = None
+    preset: Literal["fast", "paper", "ablation"] | None = None
     config: Path | None = None
     initial: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     data: Path | None = None

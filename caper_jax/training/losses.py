@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from caper_jax.config import HeatmapKind, LossWeights
@@ -85,7 +86,7 @@ def axis_offsets(
 
 
 def heatmap_target(
-    distance: Heatmap, kind: HeatmapKind = "exponential", gate: float = 0.2
+    distance: Heatmap, kind: HeatmapKind = "exponential", gate: ArrayLike = 0.2
 ) -> Heatmap:
     """Eq 5: weight of each point's vote, zero beyond ``gate`` times the farthest point.
 

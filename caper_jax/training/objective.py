@@ -412,7 +412,7 @@ class Objective:
     ) -> PartsTargets:
         offset = losses.axis_offsets(points, truth.joint_axis, truth.joint_pivot)
         distance = jnp.sqrt((offset * offset).sum(-1))
-        heatmap = losses.heatmap_target(distance, self.config.heatmap)
+        heatmap = losses.heatmap_target(distance, self.config.heatmap, self.config.heatmap_gate)
         voting = self.network.joints == "voting"
         root = se3.from_rt(truth.rotation[:, 0], truth.translation[:, 0])
         increment = se3.compose(se3.inverse(reference), root)

@@ -279,6 +279,25 @@ def test_fast_encoder_interpolates_its_centers():
     np.testing.assert_array_equal(weights.argmax(-1), np.tile(np.arange(10), (2, 1)))
 
 
+def test_centers_without_scan_order_are_at_fixed_random_places():
+    sizes = {"eval_centers": 16, "scales": (0.3,), "width": 4, "blocks": 1, "last": 4}
+    scan = FastEncoder(FastEncoderConfig(**sizes))
+    anywhere = FastEncoder(FastEncoderConfig(center_order="random", **sizes))
+    points = normal(1, 64, 3)
+    weights = random_like(variables_of(scan, points))
+    places = np.random.default_rng(0).permutation(64)
+    shuffled = np.empty((1, 64, 3), np.float32)
+    # A cloud in which every fourth point is the next of those places.
+    shuffled[:, ::4] = np.asarray(points)[:, places[:16]]
+    rest = np.asarray(points)[:, places[16:]].reshape(1, 16, 3, 3)
+    for number in range(3):
+        shuffled[:, number + 1 :: 4] = rest[:, :, number]
+    one = anywhere.apply(weights, points, train=False).levels[0].features
+    other = scan.apply(weights, jnp.asarray(shuffled), train=False).levels[0].features
+    np.testing.assert_allclose(one, other, atol=1e-4)
+    assert np.abs(one - scan.apply(weights, points, train=False).levels[0].features).max() > 0.01
+
+
 @pytest.fixture(scope="module", params=["fast", "hs"])
 def root_network(request):
     """points -> output of stage I in evaluation, with random weights."""
@@ -343,7 +362,7 @@ def test_stage_two_outputs():
 
 
 def test_presets():
-    assert set(PRESETS) == {"paper", "fast"}
+    assert set(PRESETS) == {"paper", "fast", "ablation"}
     assert preset("paper").network.encoder == "hs"
     with pytest.raises(CaperError, match=r"preset 'fats'; did you mean 'fast'"):
         preset("fats")

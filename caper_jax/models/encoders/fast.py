@@ -12,6 +12,7 @@ from __future__ import annotations
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from caper_jax.config import FastEncoderConfig
@@ -76,7 +77,10 @@ class FastEncoder(nn.Module):
         count = config.centers if train else config.eval_centers
         total = points.shape[1]
         count = min(count, total)
-        centers = points[:, jnp.arange(count) * total // count]
+        places = jnp.arange(count) * total // count
+        if config.center_order == "random":
+            places = np.random.default_rng(0).permutation(total)[:count]
+        centers = points[:, places]
         middle = points.mean(axis=1, keepdims=True)
         radius = jnp.sqrt(((points - middle) ** 2).sum(-1).mean(-1) + 1e-8)
         window = points[:, :: config.stride]
