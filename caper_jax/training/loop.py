@@ -23,7 +23,12 @@ from caper_jax.progress import progress as progress_display
 from caper_jax.training import parallel
 from caper_jax.training.checkpoints import Checkpoints
 from caper_jax.training.optimizer import Optimizer, flat_and_anneal
-from caper_jax.training.run_directory import METRICS_FILE, MetricsLog, check_configuration
+from caper_jax.training.run_directory import (
+    METRICS_FILE,
+    Logs,
+    MetricsLog,
+    check_configuration,
+)
 from caper_jax.training.step import LossFn, TrainState, compile_step
 
 PyTree = Any
@@ -119,6 +124,7 @@ def fit(
         loss_fn,
         optimizer,
         batch_fn=batch_fn,
+        data_seed=config.data_seed,
         mesh=mesh,
         batch_norm=config.batch_norm,
         save_memory=config.save_memory,
@@ -134,12 +140,45 @@ def fit(
         batch = batches(step)
         return batch if mesh is None else parallel.place_rows(batch, mesh)
 
+    def logs(step: int, saved: dict[str, Any] | None) -> MetricsLog:
+        path = directory / METRICS_FILE if jax.process_index() == 0 else None
+        return MetricsLog(path, step, config.log_steps, config.batch_size, saved)
+
+    return run_steps(directory, config, step_fn, state, batch_of, logs)
+
+
+def run_steps(
+    directory: Path,
+    config: TrainingConfig,
+    step_fn: Callable[..., tuple[TrainState, dict[str, jax.Array]]],
+    state: TrainState,
+    batch_of: Callable[[int], PyTree],
+    make_logs: Callable[[int, dict[str, Any] | None], Logs],
+    title: str = "training",
+) -> FitResult:
+    """Calls a compiled step until the budget is used up or a stop is requested; resumes.
+
+    Args:
+      directory: gets checkpoints/, from whose newest the run goes on.
+      config: the budget, and how often to save.
+      step_fn: as ``step.compile_step`` gives it; the state may be a stack of states.
+      state: before the first step; on resume its shapes, dtypes and shardings.
+      batch_of: step -> the data that ``step_fn`` takes.
+      make_logs: (step the run starts from, what they saved then or None) -> the logs.
+      title: of the progress display.
+
+    Raises:
+      CaperError: the checkpoints cannot be read or written, or the loss stays non-finite.
+    """
     with (
         Checkpoints(directory / "checkpoints", keep=config.keep_checkpoints) as checkpoints,
         StopRequest() as stop,
     ):
         state, extra = checkpoints.restore(state) or (state, {})
-        return _Run(config, directory, checkpoints, stop, state, extra).go(step_fn, batch_of)
+        started = int(np.ravel(state.step)[0])
+        logs = make_logs(started, extra.get("metrics"))
+        run = _Run(config, directory, checkpoints, stop, state, logs, bool(extra), title)
+        return run.go(step_fn, batch_of)
 
 
 class _Run:
@@ -152,24 +191,21 @@ class _Run:
         checkpoints: Checkpoints,
         stop: StopRequest,
         state: TrainState,
-        extra: dict[str, Any],
+        logs: Logs,
+        resumed: bool,
+        title: str,
     ) -> None:
         self.config = config
         self.directory = directory
         self.checkpoints = checkpoints
         self.stop = stop
         self.state = state
-        self.step = int(state.step)
-        self.saved_step = self.step if extra else -1
-        self.elapsed_before = float(state.elapsed)
+        self.logs = logs
+        self.title = title
+        self.step = int(np.ravel(state.step)[0])
+        self.saved_step = self.step if resumed else -1
+        self.elapsed_before = float(np.ravel(state.elapsed)[0])
         self.began = self.saved_at = time.monotonic()
-        self.metrics = MetricsLog(
-            directory / METRICS_FILE if jax.process_index() == 0 else None,
-            self.step,
-            config.log_steps,
-            config.batch_size,
-            extra.get("metrics"),
-        )
         # The dispatch whose metrics were not read yet: (its last step, factors, metrics).
         self.unread: tuple[int, np.ndarray, dict[str, jax.Array]] | None = None
         self.factor = 0.0
@@ -205,7 +241,7 @@ class _Run:
                 show()
             self.read()
             if finished:
-                self.metrics.flush(self.step, self.factor, self.elapsed())
+                self.logs.flush(self.step, self.factor, self.elapsed())
             self.save()
             show()
         self.checkpoints.wait()  # nobody should be told of a checkpoint that is not there yet
@@ -247,18 +283,12 @@ class _Run:
         for index, factor in enumerate(factors.tolist()):
             step = last - len(factors) + index + 1
             row = {name: values[index] for name, values in metrics.items()}
-            self.metrics.add(step, row, factor, self.elapsed())
-            bad = self.metrics.averages.bad_in_a_row
-            if bad >= self.config.max_bad_steps:
-                raise CaperError(
-                    f"training diverged: the loss or its gradient was not finite in the "
-                    f"{bad} steps up to step {step} (loss {row['loss']}); "
-                    "lower the learning rate, or look for bad samples"
-                )
+            self.logs.add(step, row, factor, self.elapsed())
+            self.logs.check(step, self.config.max_bad_steps)
             self.factor = factor
         if self.first_read:  # that dispatch compiled: its time says nothing of the rate
             self.first_read = False
-            self.metrics.restart_clock()
+            self.logs.restart_clock()
 
     def save_due(self) -> bool:
         """Whether a checkpoint is due, by the clock or by the step."""
@@ -270,12 +300,12 @@ class _Run:
     def save(self) -> None:
         """Write a checkpoint of the current step, unless it was written already."""
         self.read()
-        elapsed = np.float32(self.elapsed())
+        elapsed = np.full(self.state.elapsed.shape, self.elapsed(), np.float32)
         self.state = dataclasses.replace(
             self.state, elapsed=parallel.place(elapsed, self.state.elapsed.sharding)
         )
         if self.step != self.saved_step:
-            self.checkpoints.save(self.step, self.state, {"metrics": vars(self.metrics.averages)})
+            self.checkpoints.save(self.step, self.state, {"metrics": self.logs.saved()})
             self.saved_step = self.step
         self.saved_at = time.monotonic()
 
@@ -284,10 +314,10 @@ class _Run:
         """The progress display, in steps or in seconds; yields what brings it up to date."""
         config = self.config
         if config.steps is not None:
-            title, total = "training", config.steps
+            title, total = self.title, config.steps
         else:
             assert config.minutes is not None
-            title, total = "training (seconds)", math.ceil(60.0 * config.minutes)
+            title, total = f"{self.title} (seconds)", math.ceil(60.0 * config.minutes)
 
         def done() -> int:
             return self.step if config.steps is not None else min(int(self.elapsed()), total)
@@ -302,10 +332,10 @@ class _Run:
                 nonlocal shown
                 now = done()
                 values: dict[str, float | str] = {"step": str(self.step)}
-                if math.isfinite(self.metrics.loss):
-                    values["loss"] = self.metrics.loss
-                if math.isfinite(self.metrics.rate):
-                    values["rate"] = f"{self.metrics.rate:.0f} samples/s"
+                if math.isfinite(self.logs.loss):
+                    values["loss"] = self.logs.loss
+                if math.isfinite(self.logs.rate):
+                    values["rate"] = f"{self.logs.rate:.0f} samples/s"
                 bar.update(now - shown, **values)
                 shown = now
 

@@ -130,6 +130,26 @@ class Averages:
     bad_in_a_row: int = 0
 
 
+class Logs(typing.Protocol):
+    """What the loop tells of its steps: ``MetricsLog``, or those of many members at once."""
+
+    @property
+    def loss(self) -> float: ...
+
+    @property
+    def rate(self) -> float: ...
+
+    def restart_clock(self) -> None: ...
+
+    def add(self, step: int, values: dict[str, Any], factor: float, seconds: float) -> None: ...
+
+    def check(self, step: int, max_bad_steps: int) -> None: ...
+
+    def flush(self, step: int, factor: float, seconds: float) -> None: ...
+
+    def saved(self) -> dict[str, Any]: ...
+
+
 class MetricsLog:
     """Appends to metrics.jsonl, every ``every`` steps.
 
@@ -142,7 +162,7 @@ class MetricsLog:
       step: the step the run starts or resumes from.
       every: steps per line.
       batch_size: samples per step.
-      saved: ``vars(averages)`` when the checkpoint was written; None for a new run.
+      saved: ``saved()`` when the checkpoint was written; None for a new run.
     """
 
     def __init__(
@@ -201,6 +221,19 @@ class MetricsLog:
             now.bad_in_a_row += 1
         if step % self._every == 0:
             self.flush(step, factor, seconds)
+
+    def check(self, step: int, max_bad_steps: int) -> None:
+        """Raises a CaperError where so many steps in a row, up to this one, were not applied."""
+        bad = self.averages.bad_in_a_row
+        if bad >= max_bad_steps:
+            raise CaperError(
+                f"training diverged: the loss or its gradient was not finite in the {bad} steps "
+                f"up to step {step}; lower the learning rate, or look for bad samples"
+            )
+
+    def saved(self) -> dict[str, Any]:
+        """What a checkpoint keeps of the unfinished line."""
+        return dict(vars(self.averages))
 
     def flush(self, step: int, factor: float, seconds: float) -> None:
         """Write the line of the steps since the last one, if there are any."""

@@ -87,10 +87,14 @@ class TrainState:
         return {"params": evaluation_weights(self.params), **self.model_state}
 
 
-def step_keys(seed: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(data key, loss key) of a step: a function of seed and step only, so resumes see the same."""
-    key = jax.random.fold_in(jax.random.key(seed), step)
-    return jax.random.fold_in(key, _DATA_STREAM), jax.random.fold_in(key, _LOSS_STREAM)
+def data_key(seed: ScalarLike, step: ScalarLike) -> jax.Array:
+    """Key of a step's batch: a function of seed and step only, so that resumes see the same."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), step), _DATA_STREAM)
+
+
+def loss_key(seed: ScalarLike, step: ScalarLike) -> jax.Array:
+    """Key of a step's loss, likewise."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), step), _LOSS_STREAM)
 
 
 def train_step(
@@ -126,7 +130,7 @@ def train_step(
       step = jax.jit(partial(train_step, loss_fn=objective, optimizer=optimizer))
       state, metrics = step(state, batch)
     """
-    _, key = step_keys(state.seed, state.step)
+    key = loss_key(state.seed, state.step)
     (loss, (model_state, metrics)), gradients = value_and_grad(loss_fn, has_aux=True)(
         training_weights(state.params), state.model_state, batch, key, progress
     )
@@ -154,6 +158,7 @@ def compile_step(
     optimizer: Optimizer,
     *,
     batch_fn: Callable[..., PyTree] | None = None,
+    data_seed: int | None = None,
     mesh: jax.sharding.Mesh | None = None,
     batch_norm: BatchNormExtent = "global",
     save_memory: bool = True,
@@ -166,6 +171,7 @@ def compile_step(
       batch_fn: ``(key) -> batch`` traced into the step, or ``(key, data) -> batch`` where the
         caller passes ``data``; every leaf leads with the batch axis. None: the caller passes a
         batch, used by each of the n steps.
+      data_seed: the keys of ``batch_fn`` follow from it; None for the seed of the state.
       mesh: split the batch over this mesh's "data" axis; weights are replicated.
       batch_norm: "global": over a mesh too the step is that of the whole batch on one device.
         "local": losses, with the means in them, are those of each device's rows, averaged.
@@ -188,7 +194,7 @@ def compile_step(
     def one(state: TrainState, progress: jax.Array, factor: jax.Array, data: PyTree):
         batch = data
         if batch_fn is not None:
-            key, _ = step_keys(state.seed, state.step)
+            key = data_key(state.seed if data_seed is None else data_seed, state.step)
             batch = batch_fn(key) if data is None else batch_fn(key, data)
         if mesh is not None:
             batch = parallel.constrain_batch(batch, mesh)
@@ -209,7 +215,7 @@ def compile_step(
         return jax.lax.scan(lambda s, x: one(s, x[0], x[1], data), state, (progress, factor))
 
     device = jax.local_devices()[0] if mesh is None else mesh.devices.flat[0]
-    options: dict[str, Any] = {"compiler_options": _compiler_options(device.platform)}
+    options: dict[str, Any] = {"compiler_options": compiler_options(device.platform)}
     if mesh is not None:
         everywhere = parallel.replicated(mesh)
         given = everywhere if batch_fn is not None else parallel.batch_sharding(mesh)
@@ -221,7 +227,7 @@ def compile_step(
 _LEAST_MEMORY = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 
 
-def _compiler_options(platform: str) -> dict[str, str] | None:
+def compiler_options(platform: str) -> dict[str, str] | None:
     """On a CPU: an order of operations that holds little at once.
 
     XLA's default there runs ahead in all branches to have work for many cores; on two it takes

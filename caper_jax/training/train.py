@@ -47,9 +47,10 @@ from caper_jax.training.fit_plausibility import add_calibration
 from caper_jax.training.loop import FitResult, fit
 from caper_jax.training.objective import Objective
 from caper_jax.training.run_directory import CONFIG_FILE, STARTED_FROM
+from caper_jax.training.step import TrainState
 
 _FITTED = ("params/refiner/", "params/plausibility/")  # on the estimates of the stages
-_SAMPLE = 512  # frames that give the trivial predictor of the model card
+SAMPLE = 512  # frames that give the trivial predictor of the model card
 
 
 def preset_of(directory: str | Path, category: str) -> RunConfig:
@@ -61,7 +62,8 @@ def preset_of(directory: str | Path, category: str) -> RunConfig:
       CaperError: no model directory, a damaged card, or an unknown category.
     """
     network = network_of(read_card(directory), Path(directory))
-    names = {other.network.encoder: name for name, other in PRESETS.items()}
+    # The first preset with that encoder: "fast", not "ablation".
+    names = {other.network.encoder: name for name, other in reversed(PRESETS.items())}
     config = preset(names.get(network.encoder, "fast"), category)
     return replace(
         config, network=network, data=replace(config.data, num_points=network.num_points)
@@ -97,10 +99,8 @@ def train(
     category = categories.get(config.category) if category is None else category
     config = replace(config, category=category.name)  # FILE.py:NAME may be spelled in many ways
     objective = Objective(category, config.network, config.loss)
-    start = _start(objective, config, initial)
-    description = {name: part for name, part in to_dict(config).items() if name != "training"}
-    if start.card is not None:
-        description[STARTED_FROM] = start.card
+    start = start_from(objective.init(jax.random.key(config.training.seed)), config, initial)
+    description = describe(config, start.card)
     run = partial(
         fit,
         directory,
@@ -114,24 +114,46 @@ def train(
         result, draw_sample = _fit_generated(run, config, category)
     else:
         result, draw_sample = _fit_dataset(run, config, given)
-    if result.finished and jax.process_index() == 0 and not _complete(directory, result):
-        card = _card(config, result, draw_sample())
-        if start.card is not None:
-            card |= _with_origin(card, start.card)
-        trained = jax.device_get(result.state.variables)
-        if config.init_weight_average:
-            trained = averaged(start.weights, trained, config.init_weight_average)
-        write_model(directory, trained, card)
-        if config.loader is None:  # of the weights as they are stored, and once they are
-            _finish(config, given, directory)
-        write_card(directory, {**read_card(directory), "complete": _digest(directory)})
+    first = jax.process_index() == 0
+    if result.finished and first and not is_complete(directory, int(result.state.step)):
+        write_run(config, given, directory, result.state, draw_sample(), start)
     # The others wait: one that ends takes the run with it after some minutes.
     parallel.agree([0.0])
     return result
 
 
+def write_run(
+    config: RunConfig,
+    category: str | Category,
+    directory: str | Path,
+    state: TrainState,
+    sample: Batch,
+    start: Start,
+) -> None:
+    """Writes the model of a run whose budget is used up, and fits what belongs to it.
+
+    Args:
+      config: the run.
+      category: its name or itself, as ``categories.get`` takes both.
+      directory: of the run, with its config.json.
+      state: the last training state.
+      sample: frames like those of training, for the card's trivial predictor.
+      start: what the run started from.
+    """
+    card = _card(config, state, sample)
+    if start.card is not None:
+        card |= _with_origin(card, start.card)
+    trained = jax.device_get(state.variables)
+    if config.init_weight_average:
+        trained = averaged(start.weights, trained, config.init_weight_average)
+    write_model(directory, trained, card)
+    if config.loader is None:  # of the weights as they are stored, and once they are
+        _finish(config, category, directory)
+    write_card(directory, {**read_card(directory), "complete": _digest(directory)})
+
+
 @dataclass(frozen=True)
-class _Start:
+class Start:
     """What a run starts from: its variables; the card and the weights of another model, if any."""
 
     variables: Any
@@ -139,13 +161,23 @@ class _Start:
     weights: Any = None
 
 
-def _start(objective: Objective, config: RunConfig, initial: str | Path | None) -> _Start:
-    variables = objective.init(jax.random.key(config.training.seed))
-    start, same = _Start(variables), False
+def start_from(variables: Any, config: RunConfig, initial: str | Path | None) -> Start:
+    """What a run starts from.
+
+    Args:
+      variables: random ones of the run's seed.
+      config: the run.
+      initial: model directory, or None.
+
+    Raises:
+      CaperError: a model of another network; an ``init_weight_average`` of no model of this
+        category.
+    """
+    start, same = Start(variables), False
     if initial is not None:
         card, weights = read_model(initial)
         same = card.get("category") == config.category
-        start = _Start(initial_variables(variables, weights, initial, same), card, weights)
+        start = Start(initial_variables(variables, weights, initial, same), card, weights)
     if config.init_weight_average and not same:
         raise CaperError(
             f"init_weight_average = {config.init_weight_average} needs a model of "
@@ -154,13 +186,19 @@ def _start(objective: Objective, config: RunConfig, initial: str | Path | None) 
     return start
 
 
-def _complete(directory: str | Path, result: FitResult) -> bool:
-    """Whether the directory has the model of this run with all that belongs to it."""
+def describe(config: RunConfig, card: dict[str, Any] | None) -> dict[str, Any]:
+    """What config.json holds besides the training section; ``card`` of what the run starts from."""
+    description = {name: part for name, part in to_dict(config).items() if name != "training"}
+    return description if card is None else {**description, STARTED_FROM: card}
+
+
+def is_complete(directory: str | Path, steps: int) -> bool:
+    """Whether the directory has the model of its run after so many steps, and all it needs."""
     if not all((Path(directory) / name).is_file() for name in (CARD_FILE, WEIGHTS_FILE)):
         return False
     card = read_card(directory)
     run = card.get("complete"), card.get("steps")
-    return run == (_digest(directory), int(result.state.step))
+    return run == (_digest(directory), steps)
 
 
 def _digest(directory: str | Path) -> str:
@@ -187,14 +225,14 @@ def _fit_generated(
     run: Callable[..., FitResult], config: RunConfig, category: Category
 ) -> tuple[FitResult, Callable[[], Batch]]:
     """Trains on endless generated frames; also a function that draws some of them."""
-    generator = Generator(category, config.data, split="train", seed=config.training.seed)
+    generator = Generator(category, config.data, split="train", seed=config.training.stream)
     batch_size = config.training.batch_size
 
     def batch_fn(key, bank):
         return generator.draw(key, batch_size, bank)
 
     result = run(batch_fn=batch_fn, data=generator.bank)
-    return result, lambda: generator.batch(jax.random.key(config.training.seed), _SAMPLE)
+    return result, lambda: generator.batch(jax.random.key(config.training.stream), SAMPLE)
 
 
 def _fit_dataset(
@@ -211,7 +249,7 @@ def _fit_dataset(
         source.split,
         num_points=4 * config.network.num_points,  # every epoch picks others of them
     )
-    arguments = (config.network.num_points, config.training.seed)
+    arguments = (config.network.num_points, config.training.stream)
     with Loader(
         dataset,
         config.training.batch_size,
@@ -223,7 +261,7 @@ def _fit_dataset(
         result = run(batches=loader)
 
     def draw_sample() -> Batch:
-        size = min(_SAMPLE, len(dataset))
+        size = min(SAMPLE, len(dataset))
         with Loader(dataset, size, *arguments, process=(0, 1), prefetch=0) as once:
             return once(0)
 
@@ -292,9 +330,8 @@ def mean_pose(batch: Batch) -> dict[str, Any]:
     }
 
 
-def _card(config: RunConfig, result: FitResult, sample: Batch) -> dict[str, Any]:
+def _card(config: RunConfig, state: TrainState, sample: Batch) -> dict[str, Any]:
     """The card of both stages: what was trained on what, where, and for how long."""
-    state = result.state
     stages = replace(config, network=replace(config.network, refiner=RefinerConfig()))
     return {
         "category": config.category,

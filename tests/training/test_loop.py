@@ -23,7 +23,7 @@ from caper_jax.training import loop
 from caper_jax.training.loop import fit
 from caper_jax.training.optimizer import flat_and_anneal
 from caper_jax.training.run_directory import check_configuration, read_metrics
-from caper_jax.training.step import compile_step, step_keys
+from caper_jax.training.step import compile_step, data_key
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 BATCH = 8
@@ -80,7 +80,7 @@ def host_batches(stop_at=None, bad=()):
     def batches(step):
         if step == stop_at:
             signal.raise_signal(signal.SIGTERM)
-        batch = jax.tree.map(np.array, batch_fn(step_keys(seed, jnp.int32(step))[0]))
+        batch = jax.tree.map(np.array, batch_fn(data_key(seed, jnp.int32(step))))
         if step in bad:
             batch["x"][0, 0] = np.nan
         return batch

@@ -13,7 +13,7 @@ from _helpers.tiny import network, random_variables
 from caper_jax.config import LossConfig, LossWeights
 from caper_jax.training.objective import Objective
 from caper_jax.training.optimizer import Optimizer
-from caper_jax.training.step import TrainState, step_keys, train_step
+from caper_jax.training.step import TrainState, loss_key, train_step
 
 SEEDS = jnp.arange(3, dtype=jnp.uint32)
 
@@ -52,7 +52,7 @@ def stacked(results):
 def test_jit():
     state = create(0)
     after, metrics = STEP(state, batch(), 0.3)
-    _, key = step_keys(state.seed, state.step)
+    key = loss_key(state.seed, state.step)
     loss, _ = loss_fn(state.params.fast, state.model_state, batch(), key, 0.3)
     np.testing.assert_allclose(metrics["loss"], loss, rtol=1e-5)
     assert metrics["progress"] == np.float32(0.3) and after.step == 1
