@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from caper_jax.articulation.category import Viewpoint
@@ -112,7 +113,7 @@ def background(
     return jnp.where(uniform[0] < 0.5, jnp.minimum(table, behind), table)
 
 
-def widen(key: PRNGKeyArray, scene: Scene, rate: float) -> Scene:
+def widen(key: PRNGKeyArray, scene: Scene, rate: ArrayLike) -> Scene:
     """A mask too wide all around, by 1.5 to 8 % of the grid's side, in a fraction of the frames.
 
     It takes in what is seen there; pixels without any depth stay out.
@@ -146,7 +147,7 @@ def add_hand(
     center: Float[Any, " 3"],
     diagonal: float | Float[Any, ""],
     rays: Sequence[Float[Any, "G G"]],
-    rate: float,
+    rate: ArrayLike,
 ) -> Scene:
     """A hand that touches the object, in a fraction of the frames; in half of them in the mask.
 
@@ -192,7 +193,7 @@ def add_cable(
     scene: Scene,
     diagonal: float | Float[Any, ""],
     rays: Sequence[Float[Any, "G G"]],
-    rate: float,
+    rate: ArrayLike,
 ) -> Scene:
     """A cable, in a fraction of the frames, 2 to 15 % of the diagonal nearer or farther.
 
@@ -249,7 +250,7 @@ def fly(
     points: Float[Any, "N 3"],
     labels: Int[Any, " N"],
     reach: Float[Any, " N"],
-    largest: float,
+    largest: ArrayLike,
 ) -> tuple[Float[Array, "N 3"], Int[Array, " N"]]:
     """Points and labels of which some with a ``reach`` [N] lie anywhere up to it, in depth."""
     uniform = jax.random.uniform(key, (2 * labels.shape[0] + 1,))
@@ -264,7 +265,7 @@ def add_speckle(
     points: Float[Any, "N 3"],
     labels: Int[Any, " N"],
     diagonal: float | Float[Any, ""],
-    largest: float,
+    largest: ArrayLike,
 ) -> tuple[Float[Array, "N 3"], Int[Array, " N"]]:
     """Points and labels of which some are moved along their rays, Laplace-distributed."""
     count = labels.shape[0]
@@ -283,7 +284,7 @@ def add_specks(
     labels: Int[Any, " N"],
     center: Float[Any, " 3"],
     diagonal: float | Float[Any, ""],
-    largest: float,
+    largest: ArrayLike,
 ) -> tuple[Float[Array, "N 3"], Int[Array, " N"]]:
     """Points and labels of which some lie in a ball of 0.75 diagonals around ``center``."""
     count = labels.shape[0]
@@ -298,7 +299,7 @@ def add_specks(
 
 
 def thin_out(
-    key: PRNGKeyArray, labels: Int[Any, " N"], parts: int, rate: float
+    key: PRNGKeyArray, labels: Int[Any, " N"], parts: int, rate: ArrayLike
 ) -> Int[Array, " N"]:
     """Indices [N] of the points that stay, in a fraction of the frames fewer and repeated evenly.
 

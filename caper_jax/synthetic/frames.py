@@ -24,6 +24,7 @@ from caper_jax.synthetic import disturbances, masks
 from caper_jax.synthetic import sensor as sensors
 from caper_jax.synthetic.camera import camera_pose, draw_camera
 from caper_jax.synthetic.instances import InstanceBank, build_bank, draw_instances, split_key
+from caper_jax.synthetic.masks import is_on
 from caper_jax.synthetic.ray_casting import FAR, nearest_part, part_depths, projected_bounds
 
 FRAMES_AT_A_TIME = 25  # what the frames of a seed are depends on it
@@ -155,7 +156,7 @@ def observe(
     depth, part = (image.reshape(rays[0].shape) for image in nearest_part(alone))
     diagonal = rest_diagonal(instance.size, instance.box_center)
     behind = None
-    if config.rim > 0 or config.hand > 0 or config.cable > 0 or config.flying > 0:
+    if is_on(config.rim) or is_on(config.hand) or is_on(config.cable) or is_on(config.flying):
         behind = disturbances.background(
             jax.random.fold_in(keys.mask, 16),
             instance,
@@ -163,7 +164,7 @@ def observe(
             category.viewpoint,
             diagonal,
             rays,
-            config.rim > 0,
+            is_on(config.rim),
         )
     depth, part, hit = _apply_mask(
         keys.mask, depth, part, behind, instance, poses, rays, category, config
@@ -176,7 +177,7 @@ def observe(
     sensor = sensors.draw_sensor(keys.sensor, mix)
     surface = sensors.surface_map(depth, hit, rays)
     seen = sensors.valid_pixels(keys.loss, sensor, surface, hit)
-    if config.dropout > 0 or config.holes > 0:
+    if is_on(config.dropout) or is_on(config.holes):
         lost_key = jax.random.fold_in(keys.loss, 1)
         lost = masks.missing_depth(lost_key, hit, config.dropout, config.holes)
         seen = masks.keep_most(seen & ~lost, seen)
@@ -187,14 +188,14 @@ def observe(
     chosen = jax.tree.map(lambda image: image.ravel()[index], surface)
     points = sensors.measure(keys.noise, sensor, chosen, (flat[0][index], flat[1][index]))
     labels = part.ravel()[index]
-    if config.flying > 0:
+    if is_on(config.flying):
         reach = disturbances.jump_reach(depth, behind, diagonal).ravel()[index]
         fly_key = jax.random.fold_in(keys.noise, 16)
         points, labels = disturbances.fly(fly_key, points, labels, reach, config.flying)
-    if config.residue > 0:
+    if is_on(config.residue):
         points, labels = _add_residue(keys.residue, points, labels, diagonal, config.residue)
     points, labels = _add_stray(keys, points, labels, instance, poses, diagonal, config)
-    if config.depth_scale > 0:
+    if is_on(config.depth_scale):
         error = jax.random.normal(jax.random.fold_in(keys.sensor, 1))
         points *= 1.0 + config.depth_scale * jnp.clip(error, -3.0, 3.0)
     pose = articulated_pose(instance, state, poses)
@@ -203,16 +204,16 @@ def observe(
 
 def _add_stray(keys: FrameKeys, points, labels, instance, poses, diagonal, config):
     """Points and labels with speckle and specks, or fewer of them."""
-    if config.speckle > 0:
+    if is_on(config.speckle):
         key = jax.random.fold_in(keys.residue, 16)
         points, labels = disturbances.add_speckle(key, points, labels, diagonal, config.speckle)
-    if config.specks > 0:
+    if is_on(config.specks):
         key = jax.random.fold_in(keys.residue, 17)
         center = disturbances.object_center(instance, poses)
         points, labels = disturbances.add_specks(
             key, points, labels, center, diagonal, config.specks
         )
-    if config.few_points > 0:
+    if is_on(config.few_points):
         key = jax.random.fold_in(keys.pick, 16)
         index = disturbances.thin_out(key, labels, len(poses), config.few_points)
         points, labels = points[index], labels[index]
@@ -222,9 +223,9 @@ def _add_stray(keys: FrameKeys, points, labels, instance, poses, diagonal, confi
 def _ray_grid(key, instance: InstanceBank, poses, config: GeneratorConfig):
     """Rays (x [G, G], y [G, G]) over the object's projection, with a random sub-pixel offset."""
     low, high = projected_bounds(instance.groups, poses)
-    if config.table > 0 or config.clutter > 0 or config.rim > 0:
+    if is_on(config.table) or is_on(config.clutter) or is_on(config.rim):
         # Room for what a mask that is too wide takes in.
-        margin = _WIDE_MARGIN if config.rim > 0 else _MARGIN
+        margin = _WIDE_MARGIN if is_on(config.rim) else _MARGIN
         low, high = low - margin * (high - low), high + margin * (high - low)
     steps = jnp.arange(config.grid) + 0.0
     offset = jax.random.uniform(key, (2,))
@@ -246,32 +247,32 @@ def _apply_mask(
 ):
     """Depth, part and pixels [G, G] that the mask takes for the object."""
     hit = part >= 0
-    if config.occlusion > 0:
+    if is_on(config.occlusion):
         hit = masks.occlude(key, hit, config.occlusion, config.occluders)
     scene = disturbances.Scene(depth, part, hit, behind)
     diagonal = rest_diagonal(instance.size, instance.box_center)
-    if config.hand > 0:
+    if is_on(config.hand):
         center = disturbances.object_center(instance, poses)
         scene = disturbances.add_hand(
             jax.random.fold_in(key, 17), scene, center, diagonal, rays, config.hand
         )
-    if config.cable > 0:
+    if is_on(config.cable):
         cable_key = jax.random.fold_in(key, 18)
         scene = disturbances.add_cable(cable_key, scene, diagonal, rays, config.cable)
-    if config.rim > 0:
+    if is_on(config.rim):
         scene = disturbances.widen(jax.random.fold_in(key, 19), scene, config.rim)
     depth, part, hit, _ = scene
-    if config.table > 0 or config.clutter > 0:
+    if is_on(config.table) or is_on(config.clutter):
         table = masks.table_depth(instance, poses, category.viewpoint, rays)
-    if config.table > 0:
+    if is_on(config.table):
         depth, hit = masks.spill_on_table(
             jax.random.fold_in(key, 3), depth, part, hit, table, config.table, config.spill
         )
-    if config.erosion > 0:
+    if is_on(config.erosion):
         eroded = masks.erode(jax.random.fold_in(key, 2), hit, config.erosion)
         # A mask that takes in the table is not too tight.
         hit = jnp.where((hit & (part < 0)).any(), hit, eroded)
-    if config.clutter > 0:
+    if is_on(config.clutter):
         depth, part, hit = masks.add_clutter(
             jax.random.fold_in(key, 4),
             depth,
@@ -294,6 +295,32 @@ def _add_residue(key, points, labels, diagonal, largest: float):
     push = -jnp.log(uniform[count:-1]) * 0.2 * diagonal
     factor = 1.0 + jnp.where(chosen, push / jnp.linalg.norm(points, axis=-1), 0.0)
     return points * factor[:, None], jnp.where(chosen, -1, labels)
+
+
+def draw_frames(
+    key: PRNGKeyArray,
+    batch_size: int,
+    category: Category,
+    config: GeneratorConfig,
+    mix: sensors.Sensor,
+    bank: InstanceBank,
+) -> Batch:
+    """A batch of frames of instances of a bank: what ``Generator`` draws, as a pure function.
+
+    Args:
+      key: PRNG key.
+      batch_size: B.
+      category: static.
+      config: what disturbs the frames; rates may be traced, and count as above 0 then.
+      mix: sensors to draw from, ``sensor.sensor_mix(config.noise)``.
+      bank: the instances.
+    """
+    pick, rest = jax.random.split(key)
+    index = jax.random.randint(pick, (batch_size,), 0, bank.num_instances)
+    instances = jax.tree.map(lambda values: values[index], bank)
+    frame = partial(render_frame, category=category, config=config, mix=mix)
+    frames = jax.vmap(frame)(jax.random.split(rest, batch_size), instances)
+    return replace(frames, instance=index)
 
 
 class Generator:
@@ -324,12 +351,7 @@ class Generator:
     def draw(self, key: PRNGKeyArray, batch_size: int, bank: InstanceBank | None = None) -> Batch:
         """Traceable form of ``batch``: call it inside a larger jitted function."""
         bank = self.bank if bank is None else bank
-        pick, rest = jax.random.split(key)
-        index = jax.random.randint(pick, (batch_size,), 0, bank.num_instances)
-        instances = jax.tree.map(lambda values: values[index], bank)
-        frame = partial(render_frame, category=self.category, config=self.config, mix=self._mix)
-        frames = jax.vmap(frame)(jax.random.split(rest, batch_size), instances)
-        return replace(frames, instance=index)
+        return draw_frames(key, batch_size, self.category, self.config, self._mix, bank)
 
     def batch(self, key: PRNGKeyArray, batch_size: int) -> Batch:
         """A batch of frames; the same key gives the same batch.

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from caper_jax.articulation.category import Viewpoint
@@ -26,6 +27,11 @@ _FARTHEST_TABLE_M = 6.0
 _KEPT = 0.3  # an object of which less would stay is left as it is
 
 
+def is_on(rate: Any) -> bool:
+    """Whether a rate may be above 0; of one that is traced, nobody knows."""
+    return isinstance(rate, jax.core.Tracer) or bool(rate > 0)
+
+
 def keep_most(remaining: Bool[Array, "G G"], hit: Bool[Array, "G G"]) -> Bool[Array, "G G"]:
     """``remaining`` [G, G], or ``hit`` where too little of it would be left."""
     return jnp.where(enough(remaining, hit), remaining, hit)
@@ -37,7 +43,7 @@ def enough(remaining: Bool[Array, "G G"], whole: Bool[Array, "G G"]) -> Bool[Arr
 
 
 def occlude(
-    key: PRNGKeyArray, hit: Bool[Array, "G G"], rate: float, shapes: tuple[str, ...]
+    key: PRNGKeyArray, hit: Bool[Array, "G G"], rate: ArrayLike, shapes: tuple[str, ...]
 ) -> Bool[Array, "G G"]:
     """The hits that something in front of the object leaves.
 
@@ -71,7 +77,7 @@ def occlude(
     return keep_most(hit & (kept | (uniform[2] >= rate)), hit)
 
 
-def erode(key: PRNGKeyArray, hit: Bool[Array, "G G"], rate: float) -> Bool[Array, "G G"]:
+def erode(key: PRNGKeyArray, hit: Bool[Array, "G G"], rate: ArrayLike) -> Bool[Array, "G G"]:
     """The hits left by a mask that is too tight, by 1 to 3 % of the grid's side.
 
     Args:
@@ -140,7 +146,7 @@ def nearest_pixels(
 
 
 def missing_depth(
-    key: PRNGKeyArray, hit: Bool[Array, "G G"], share: float, holes: float
+    key: PRNGKeyArray, hit: Bool[Array, "G G"], share: ArrayLike, holes: ArrayLike
 ) -> Bool[Array, "G G"]:
     """Pixels without depth.
 
@@ -156,11 +162,11 @@ def missing_depth(
     """
     lone_key, share_key, hole_key = jax.random.split(key, 3)
     missing = jnp.zeros_like(hit)
-    if share > 0:
+    if is_on(share):
         # Eight random bits per pixel are enough and cost a quarter of 32.
         bits = jax.random.bits(lone_key, hit.shape, jnp.uint8)
         missing |= bits < share * jax.random.uniform(share_key) * 256.0
-    if holes > 0:
+    if is_on(holes):
         uniform = jax.random.uniform(hole_key, (_HOLES, 5))
         number = jnp.where(uniform[0, 3] < holes, 1.0 + jnp.floor(uniform[1, 3] * _HOLES), 0.0)
         rows, columns = (jnp.arange(side) + 0.0 for side in hit.shape)
@@ -212,8 +218,8 @@ def spill_on_table(
     part: Int[Any, "G G"],
     hit: Bool[Array, "G G"],
     table: Float[Any, "G G"],
-    rate: float,
-    spill: float,
+    rate: ArrayLike,
+    spill: ArrayLike,
 ) -> tuple[Float[Array, "G G"], Bool[Array, "G G"]]:
     """A mask that is too wide along a stretch of the silhouette and takes in the table there.
 
@@ -243,8 +249,8 @@ def add_clutter(
     table: Float[Any, "G G"],
     diagonal: float | Float[Any, ""],
     rays: Sequence[Float[Any, "G G"]],
-    rate: float,
-    spill: float,
+    rate: ArrayLike,
+    spill: ArrayLike,
 ) -> tuple[Float[Array, "G G"], Int[Array, "G G"], Bool[Array, "G G"]]:
     """A blob of some other surface at the silhouette, in front of the object or behind it.
 
