@@ -38,6 +38,7 @@ from .training.objective import Objective
 from .training.optimizer import Optimizer
 from .training.step import TrainState, train_step
 from .training.train import train
+from .training.train_many import MemberResult, train_many
 from .visualization.picture import write_picture
 from .visualization.scene import Scene
 
@@ -54,6 +55,7 @@ __all__ = [
     "Joint",
     "LossConfig",
     "LossWeights",
+    "MemberResult",
     "NetworkConfig",
     "ObjectModel",
     "Objective",
@@ -100,6 +102,7 @@ __all__ = [
     "so3",
     "track_step",
     "train",
+    "train_many",
     "train_step",
     "write_picture",
 ]

@@ -37,6 +37,24 @@ def processor() -> str:
     return _cpu_fact("model name") or platform.processor() or platform.machine()
 
 
+def free_bytes() -> float | None:
+    """Memory that this process may still take on its device; None where nobody says."""
+    import jax
+
+    device = jax.local_devices()[0]
+    if device.platform != "cpu":
+        stats = device.memory_stats() or {}
+        if "bytes_limit" not in stats:
+            return None
+        return float(stats["bytes_limit"] - stats.get("bytes_in_use", 0))
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return None
+    known = dict(line.split(":", 1) for line in lines)
+    return 1024.0 * int(known["MemAvailable"].split()[0]) if "MemAvailable" in known else None
+
+
 def load_average() -> float:
     """Processes that wanted to run, mean over the last minute."""
     return round(os.getloadavg()[0], 2)

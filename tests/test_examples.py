@@ -122,8 +122,9 @@ def test_own_reader(tmp_path):
         assert f"truth, {part}: 0.00 deg, IoU 1.000" in text
 
 
-def test_many_seeds():
-    text = run("10", "--seeds", "2", "--steps", "3", "--batch-size", "2")
+def test_many_seeds(tmp_path):
+    small = ("--seeds", "2", "--steps", "3", "--batch-size", "2")
+    text = run("10", *small, "--out", tmp_path)
     rows = text.splitlines()[-3:]
     assert all(row.count("+-") == 2 and "nan" not in row for row in rows)
 
