@@ -17,6 +17,7 @@ COMMANDS = {
     "estimate": "estimate poses from your own depth image or point cloud",
     "generate": "write synthetic labeled data",
     "train": "train a category's networks, or resume a run",
+    "ablate": "compare variants of a training over several seeds",
     "calibrate": "calibrate what a model says about its own errors",
     "export": "write a model that runs without this package",
     "track": "track an object through videos or a live stream",

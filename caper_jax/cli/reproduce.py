@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from caper_jax.cli import common
@@ -24,8 +25,8 @@ EXAMPLES = (
     ("table6 --category laptop", "one category, on generated videos"),
     ("table6 --data PM-Videos --format pm-videos", "on the paper's data"),
     ("table10 --weights runs/arm --frames 1000", "errors against frame, long videos"),
-    ("table9 --category box --seeds 3 --minutes 30", "trains six models"),
-    ("table7 --category laptop --steps 4000 --seeds 1", "trains two models"),
+    ("table9 --category box --seeds 3 --steps 2000", "trains six models"),
+    ("table7 --category laptop --preset fast", "trains 16 models of full size"),
     ("robustness --category box", "what stray points do"),
     ("jitter --category box --videos 4", "a quick look"),
 )
@@ -42,7 +43,7 @@ _STATIC = (
 )
 _TRAINED = (
     *("category", "frames", "data", "format", "split", "seed", "noise"),
-    *("seeds", "minutes", "steps", "initial", "settings"),
+    *("seeds", "steps", "preset", "initial", "settings"),
 )
 _ROBUST = ("category", "frames", "weights", "seed", "noise")
 _MOVING = ("category", "videos", "frames", "weights", "seed", "noise", "network_alone")
@@ -69,13 +70,13 @@ REPRODUCTIONS = {
     "table2": Reproduction("static", "pose estimation, ReArtMix categories", _STATIC),
     "table3": Reproduction("static", "pose estimation, seven parts of an arm", _STATIC),
     "ablations": Reproduction(
-        "ablations", "table 1 without the paper's ideas; trains four models", _TRAINED
+        "ablations", "table 1 without ideas of the paper and of ours; trains all", _TRAINED
     ),
     "table7": Reproduction(
-        "root_pose", "the root from its own points or from the whole; trains both", _TRAINED
+        "ablations", "the root from its own points or from the whole; trains both", _TRAINED
     ),
     "figure11": Reproduction(
-        "root_pose", "rotation decoupled or regressed directly; trains both", _TRAINED
+        "ablations", "rotation decoupled or regressed directly; trains both", _TRAINED
     ),
     "table8": Reproduction("static", "pose estimation by how much is hidden", _STATIC),
     "table4": Reproduction("tracking", "pose tracking, ReArt-Videos categories", _TRACKED),
@@ -141,9 +142,6 @@ def _what(name: str | None) -> str:
 
 def run(parsed: tuple[str, Options]) -> int:
     """Runs the command; returns its exit code."""
-    from caper_jax.reproduce.report import markdown, write_report
-    from caper_jax.visualization.plots import write_plot
-
     name, given = parsed
     options = replace(
         given,
@@ -152,14 +150,22 @@ def run(parsed: tuple[str, Options]) -> int:
         initial=given.initial and common.model_folder(given.initial),
     )
     module = importlib.import_module(f"caper_jax.reproduce.{REPRODUCTIONS[name].module}")
-    report = _with_machine(module.run(name, options))
-    options.out.mkdir(parents=True, exist_ok=True)
-    written = write_report(options.out, name, report)
+    show_report(module.run(name, options), name, options.out)
+    return 0
+
+
+def show_report(report: Report, name: str, out: Path) -> None:
+    """Writes a report with its pictures, prints it, and says where it is."""
+    from caper_jax.reproduce.report import markdown, write_report
+    from caper_jax.visualization.plots import write_plot
+
+    report = _with_machine(report)
+    out.mkdir(parents=True, exist_ok=True)
+    written = write_report(out, name, report)
     for end, plot in report.curves.items():
-        written.append(write_plot(options.out / f"{name}_{end}.png", plot))
+        written.append(write_plot(out / f"{name}_{end}.png", plot))
     print(markdown(report))
     print(f"written: {', '.join(map(str, written))}")
-    return 0
 
 
 def _with_machine(report: Report) -> Report:

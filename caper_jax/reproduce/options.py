@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from caper_jax.config import GeneratorConfig
 
 SPLIT = "test"
-DEFAULT_MINUTES = 60.0
 Count = Annotated[int, Ge(1)]
 Positive = Annotated[float, Gt(0)]
 
@@ -46,9 +45,9 @@ class Options:
       noise: of generated depth (default: kinect)
       given_masks: add rows with the data's part labels
       network_alone: track without registration, as the paper does
-      seeds: runs to train of each kind
-      minutes: of training per run (default: 60)
-      steps: of training per run, instead of --minutes
+      seeds: models to train of each variant, with the seeds 0, 1, ... (default: the study's)
+      steps: of each training (default: the study's)
+      preset: that all variants start from: fast, paper or ablation (default: the study's)
       initial: model that each run starts from, as for caper train (default: none)
       out: folder of results, generated videos and runs
       settings: of the runs, "section.key=value"
@@ -67,9 +66,9 @@ class Options:
     noise: Literal["none", "gauss3mm", "kinect", "realsense"] | None = None
     given_masks: bool = False
     network_alone: bool = False
-    seeds: Count = 3
-    minutes: Positive | None = None
+    seeds: Count | None = None
     steps: Count | None = None
+    preset: Literal["fast", "paper", "ablation"] | None = None
     initial: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     out: Path = Path("outputs") / "reproduce"
     settings: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
@@ -106,13 +105,3 @@ class Options:
         if self.noise is not None:
             raise CaperError("--noise is of generated depth; leave out --data or --noise")
         return self.format, self.data, self.split or SPLIT
-
-    def budget(self) -> str:
-        """Of each run to train, as in the name of its folder: ``3000steps`` or ``60min``.
-
-        Raises:
-          CaperError: a budget in both steps and minutes.
-        """
-        if self.steps is not None and self.minutes is not None:
-            raise CaperError("--steps and --minutes exclude each other")
-        return f"{self.steps}steps" if self.steps else f"{self.minutes or DEFAULT_MINUTES:g}min"

@@ -13,7 +13,7 @@ from tabulate import tabulate
 from caper_jax import categories
 from caper_jax.files import write_atomically
 from caper_jax.reproduce.paper import Figures
-from caper_jax.visualization.plots import Curves, Scatter
+from caper_jax.visualization.plots import Plot
 
 # Columns of ``error_rows`` after those that say of what: category, part and a condition.
 ERROR_HEADER = (
@@ -60,7 +60,7 @@ class Report:
     tables: Sequence[Table]
     facts: Sequence[str]
     result: dict[str, Any]
-    curves: Mapping[str, Curves | Scatter] = field(default_factory=dict)
+    curves: Mapping[str, Plot] = field(default_factory=dict)
 
 
 def markdown(report: Report) -> str:

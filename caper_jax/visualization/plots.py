@@ -38,8 +38,19 @@ class Scatter:
     panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
-def write_plot(path: str | Path, plot: Curves | Scatter) -> Path:
-    """Writes a PNG of lines with axes, title and legend, or of points in panels.
+@dataclass(frozen=True)
+class Intervals:
+    """Values with their intervals about zero, a panel per label: name -> (value, low, high)."""
+
+    title: str
+    panels: dict[str, dict[str, tuple[float, float, float]]]
+
+
+Plot = Curves | Scatter | Intervals
+
+
+def write_plot(path: str | Path, plot: Plot) -> Path:
+    """Writes a PNG of lines with axes, title and legend, of points in panels, or of intervals.
 
     Points beyond the axes, which hold 98 % of all, are drawn at their edge.
 
@@ -53,8 +64,10 @@ def write_plot(path: str | Path, plot: Curves | Scatter) -> Path:
     figure = Figure(figsize=_SIZE, dpi=_DPI, facecolor="white", layout="constrained")
     if isinstance(plot, Curves):
         _draw_curves(figure, plot)
-    else:
+    elif isinstance(plot, Scatter):
         _draw_scatter(figure, plot)
+    else:
+        _draw_intervals(figure, plot)
     return save_figure(figure, path)
 
 
@@ -81,6 +94,25 @@ def _draw_scatter(figure: Figure, scatter: Scatter) -> None:
         axes.grid(alpha=0.3)
     figure.colorbar(drawn, ax=panels, label=scatter.color_label, shrink=0.8)
     figure.suptitle(scatter.title)
+
+
+def _draw_intervals(figure: Figure, intervals: Intervals) -> None:
+    """One row per name, top to bottom; those that leave out zero are darker."""
+    names = list(dict.fromkeys(name for panel in intervals.panels.values() for name in panel))
+    figure.set_size_inches(_SIZE[0], max(_SIZE[1], 1.5 + 0.28 * len(names)))
+    panels = figure.subplots(1, len(intervals.panels), sharey=True, squeeze=False)[0]
+    for axes, (label, values) in zip(panels, intervals.panels.items(), strict=True):
+        axes.axvline(0.0, color="0.4", linewidth=1.0)
+        for name, (value, low, high) in values.items():
+            color = "0.6" if low <= 0.0 <= high else "tab:red" if value > 0 else "tab:blue"
+            row = names.index(name)
+            axes.plot([low, high], [row, row], color=color, linewidth=2.0)
+            axes.plot([value], [row], "o", color=color, markersize=5)
+        axes.set(xlabel=label)
+        axes.grid(alpha=0.3, axis="x")
+    panels[0].set_yticks(range(len(names)), names, fontsize=8)
+    panels[0].set_ylim(len(names) - 0.5, -0.5)
+    figure.suptitle(intervals.title, fontsize=10)
 
 
 def training_curves(title: str, rows: Sequence[dict[str, Any]]) -> Curves:
