@@ -647,8 +647,11 @@ FAST = RunConfig(
         point_stride=4,
     ),
     # exp(-D) is nearly constant inside the gate; a penalty of 20 drowns every other loss where
-    # states near zero are common. Increments weigh as much as absolute rotations.
-    loss=LossConfig(heatmap="linear", state_penalty=1.0, weights=LossWeights(twist=8.0)),
+    # states near zero are common. Increments weigh as much as absolute rotations, and confidences
+    # by their mean over both directions, with which the shipped models were trained.
+    loss=LossConfig(
+        heatmap="linear", state_penalty=1.0, weights=LossWeights(confidence=0.5, twist=8.0)
+    ),
     training=TrainingConfig(
         optimizer="adamw", learning_rate=2e-3, warmup=200, weight_decay=1e-4, minutes=60.0
     ),

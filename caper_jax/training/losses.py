@@ -60,10 +60,10 @@ def confidence_loss(
       sharpness: 13.7 puts the target at 0.5 for an error of 12.9 deg.
 
     Returns:
-      [B], mean over the two directions.
+      [B], sum over the two directions, as in Eq 17.
     """
     goodness = jnp.exp(-sharpness * ((predicted - target) ** 2).sum(-1))
-    return jnp.abs(confidence - goodness).mean(-1)
+    return jnp.abs(confidence - goodness).sum(-1)
 
 
 def axis_offsets(
