@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float, Shaped
 
 from caper_jax.errors import CaperError
+from caper_jax.models.linear_map import linear_map
 
 
 def after(done: Shaped[Array, ""], array: Shaped[Array, "..."]) -> Shaped[Array, "..."]:
@@ -70,34 +71,37 @@ def mixed_precision_dot(inputs, kernel, dimensions, precision=None):
     return lax.dot_general(inputs, kernel, dimensions, precision)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+@partial(jax.custom_jvp, nondiff_argnums=(2, 3))
 def weights_first(inputs, kernel, dimensions, precision=None):
     """``mixed_precision_dot`` of [..., C] and [C, D] that backpropagates to the kernel first.
 
     The inputs, often the largest arrays of a step, are then gone before the gradient goes on to
-    what they were computed from. In reverse mode only. For ``Dense(dot_general=...)``.
+    what they were computed from. For ``Dense(dot_general=...)``.
     """
     return mixed_precision_dot(inputs, kernel, dimensions, precision)
 
 
-def _weights_first_forward(inputs, kernel, dimensions, precision):
-    return weights_first(inputs, kernel, dimensions, precision), (inputs, kernel)
+@weights_first.defjvp
+def _weights_first_jvp(dimensions, precision, primals, tangents):
+    def change(factors, changes):
+        (inputs, kernel), (d_inputs, d_kernel) = factors, changes
+        by_inputs = lax.dot_general(d_inputs, kernel, dimensions, precision)
+        return by_inputs + lax.dot_general(inputs, d_kernel, dimensions, precision)
 
+    def transpose(factors, cotangent):
+        inputs, kernel = factors
+        rows = tuple(range(inputs.ndim - 1))
+        # A CPU transposes the first factor, which takes longer than the product: the narrower one.
+        wider = inputs.shape[-1] > cotangent.shape[-1]
+        pair = (cotangent, inputs) if wider else (inputs, cotangent)
+        to_kernel = lax.dot_general(*pair, ((rows, rows), ((), ())), precision)
+        to_kernel = to_kernel.T if wider else to_kernel
+        last = ((cotangent.ndim - 1,), (1,))
+        to_inputs = lax.dot_general(cotangent, kernel, (last, ((), ())), precision)
+        return after(to_kernel[0, 0], to_inputs), to_kernel
 
-def _weights_first_backward(dimensions, precision, residuals, cotangent):
-    inputs, kernel = residuals
-    rows = tuple(range(inputs.ndim - 1))
-    # A CPU transposes the first factor, which takes longer than the product: the narrower one.
-    wider = inputs.shape[-1] > cotangent.shape[-1]
-    factors = (cotangent, inputs) if wider else (inputs, cotangent)
-    to_kernel = lax.dot_general(*factors, ((rows, rows), ((), ())), precision)
-    to_kernel = to_kernel.T if wider else to_kernel
-    last = ((cotangent.ndim - 1,), (1,))
-    to_inputs = lax.dot_general(cotangent, kernel, (last, ((), ())), precision)
-    return after(to_kernel[0, 0], to_inputs), to_kernel
-
-
-weights_first.defvjp(_weights_first_forward, _weights_first_backward)
+    value = mixed_precision_dot(primals[0], primals[1], dimensions, precision)
+    return value, linear_map(change, transpose, primals, tangents)
 
 
 class Weights:

@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _helpers.tiny import HS, random_like
+from _helpers.tiny import HS, network, random_like, random_variables
+from jax.flatten_util import ravel_pytree
 
 from caper_jax import categories
 from caper_jax.config import HSEncoderConfig, preset
+from caper_jax.estimator import estimate
 from caper_jax.models.encoders.hs import HSEncoder, neighborhoods
 from caper_jax.models.parts import PartsNetwork
 from caper_jax.models.root import RootNetwork
@@ -221,3 +223,65 @@ def test_neighborhoods_serve_every_pose_of_the_cloud():
         apply(variables, cloud, space),
         apply(variables, cloud, None),
     )
+
+
+def slopes(function, at, step=1e-8):
+    """Slopes [M] of a function of a pytree along one direction, forward and by differences; and of
+    a random sum of its values, forward and in reverse.
+
+    The step is small: a set of neighbors that changes within it makes the function jump.
+    """
+    flat, unravel = ravel_pytree(at)
+    along = np.random.default_rng(2).normal(size=flat.size)
+
+    @jax.jit  # once, for the value at three places
+    def differentiate(shift):
+        def moved(shift):
+            return function(unravel(flat + shift * along))
+
+        value, pull = jax.vjp(moved, shift)
+        weights = np.random.default_rng(3).normal(size=value.shape)
+        forward = jax.jacfwd(moved)(shift)
+        return value, forward, forward @ weights, pull(jnp.asarray(weights))[0]
+
+    _, forward, summed, backward = differentiate(0.0)
+    numerical = (differentiate(step)[0] - differentiate(-step)[0]) / (2 * step)
+    return forward, numerical, summed, backward
+
+
+def test_forward_mode_equals_reverse_mode_and_difference_quotients():
+    """By all weights and points at once."""
+    module = HSEncoder(HS)
+    variables = random_like(shapes_of(module, 64))
+    points = np.random.default_rng(1).normal(size=(2, 64, 3))
+
+    def function(at):
+        features = module.apply({**variables, "params": at["params"]}, at["points"], train=False)
+        levels = [jnp.square(level.features).mean((1, 2)) for level in features.levels]
+        return jnp.concatenate([*levels, features.shared.ravel()])
+
+    with jax.enable_x64(True):
+        at = {"params": variables["params"], "points": points}
+        at = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), at)
+        forward, numerical, summed, backward = slopes(function, at)
+    assert np.abs(forward).min() > 1e-3
+    np.testing.assert_allclose(summed, backward, rtol=1e-10)
+    np.testing.assert_allclose(forward, numerical, rtol=1e-5, atol=1e-5)
+
+
+def test_estimates_of_the_paper_network_are_differentiable_forward_and_backward():
+    """Poses and joints by the points of a cloud, through both stages and the voting."""
+    box = categories.get("box")
+    sizes = network("hs", pool_first=True, refine_steps=0)
+    variables = random_variables(box, sizes)
+    points = np.random.default_rng(4).normal((0, 0, 0.8), 0.1, (1, 64, 3))
+
+    def function(points):
+        pose = estimate(variables, points, box, sizes).pose
+        return ravel_pytree((pose.rotation, pose.translation, pose.joint_state, pose.size))[0]
+
+    with jax.enable_x64(True):
+        forward, numerical, summed, backward = slopes(function, jnp.asarray(points))
+    assert np.abs(forward).max() > 0.1
+    np.testing.assert_allclose(summed, backward, rtol=1e-8)
+    np.testing.assert_allclose(forward, numerical, rtol=1e-4, atol=1e-4)

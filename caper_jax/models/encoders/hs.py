@@ -23,7 +23,6 @@ from caper_jax.models.encoders.neighbors import (
 )
 from caper_jax.models.layers import BatchNorm, Dense, Weights, max_over_points, weights_first
 
-# Reverse mode is all there is here anyway: the reductions over neighbors know no other.
 dense = partial(Dense, dot_general=weights_first)
 
 

@@ -2,7 +2,8 @@
 
 Both reductions are maxima over k neighbors. They loop over the neighbors with a running maximum
 (the [N, k, C] tensor is never built) and keep the winner's number, so that the backward pass
-scatters once; plain automatic differentiation costs some thirty times the forward pass.
+scatters once; plain automatic differentiation costs some thirty times the forward pass. Forward
+mode and higher derivatives work as well.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Shaped
+
+from caper_jax.models.linear_map import linear_map
 
 BLOCK_ABOVE = 4096  # points, beyond which distances are not held all at once
 _BLOCK = 512  # queries whose distances are
@@ -216,7 +219,7 @@ def _winners(direction, index, features, weights):
     return best, winner
 
 
-@jax.custom_vjp
+@jax.custom_jvp
 def directional_max(
     direction: Float[Array, "B N k 3"],
     index: Int[Array, "B N k"],
@@ -234,12 +237,38 @@ def directional_max(
     return _winners(direction, index, features, weights)[0]
 
 
-def _directional_max_forward(direction, index, features, weights):
+@directional_max.defjvp
+def _directional_max_jvp(primals, tangents):
+    direction, index, features, weights = primals
     best, winner = _winners(direction, index, features, weights)
-    return best, (direction, index, features, weights, winner)
+    changes = tangents[0], tangents[2], tangents[3]
+    # Of the residuals only the winner's number is [N, C]: the rest is found again from it.
+    return best, linear_map(
+        _directional_change, _directional_transpose, (*primals, winner), changes
+    )
 
 
-def _directional_max_backward(residuals, cotangent):
+def _directional_change(residuals, changes):
+    """How the winners' terms change with direction, features and weights."""
+    direction, index, features, weights, winner = residuals
+    d_direction, d_features, d_weights = changes
+    parts = (jnp.moveaxis(array, 2, 0) for array in (direction, index, d_direction))
+
+    def body(total, neighbor):
+        number, toward, at, d_toward = neighbor
+        _, change = jax.jvp(
+            lambda toward, features, weights: _term(toward, at, features, weights),
+            (toward, features, weights),
+            (d_toward, d_features, d_weights),
+        )
+        return jnp.where(winner == number, change, total), None
+
+    numbers = jnp.arange(index.shape[2], dtype=jnp.uint8)
+    start = jnp.zeros(winner.shape, jnp.result_type(*jax.tree.leaves((direction, *residuals[2:4]))))
+    return lax.scan(body, start, (numbers, *parts))[0]
+
+
+def _directional_transpose(residuals, cotangent):
     direction, index, features, weights, winner = residuals
     channels = weights.shape[1]
     batch = cotangent.shape[0]
@@ -283,13 +312,10 @@ def _directional_max_backward(residuals, cotangent):
 
     _, d_direction = lax.scan(toward_points, None, per_neighbor)
     d_direction = jnp.moveaxis(d_direction, 0, 2).astype(direction.dtype)
-    return d_direction, None, d_features, d_weights.astype(weights.dtype)
+    return d_direction, d_features, d_weights.astype(weights.dtype)
 
 
-directional_max.defvjp(_directional_max_forward, _directional_max_backward)
-
-
-@jax.custom_vjp
+@jax.custom_jvp
 def neighbor_max(
     features: Float[Array, "B M C"], index: Int[Array, "B N k"]
 ) -> Float[Array, "B N C"]:
@@ -310,23 +336,11 @@ def _neighbor_winners(features, index):
     return lax.scan(body, start, index[1:])[0]
 
 
-def _neighbor_max_forward(features, index):
-    best, row = _neighbor_winners(features, index)
-    return best, (features, row)
-
-
-def _neighbor_max_backward(residuals, cotangent):
-    features, row = residuals
-    batch, _, channels = features.shape
+@neighbor_max.defjvp
+def _neighbor_max_jvp(primals, tangents):
+    best, row = _neighbor_winners(*primals)
+    change, _ = tangents
+    batch, _, channels = change.shape
+    # Of one flat row, which transposes to one scatter.
     flat = (row * channels + jnp.arange(channels)).reshape(batch, -1)
-
-    def scatter(zero, at, value):
-        return zero.at[at].add(value, mode="promise_in_bounds")
-
-    zeros = jnp.zeros((batch, features.shape[1] * channels), features.dtype)
-    return jax.vmap(scatter)(zeros, flat, cotangent.reshape(batch, -1)).reshape(
-        features.shape
-    ), None
-
-
-neighbor_max.defvjp(_neighbor_max_forward, _neighbor_max_backward)
+    return best, gather(change.reshape(batch, -1), flat).reshape(best.shape)
