@@ -135,7 +135,8 @@ def geodesic_distance(a: ArrayLike, b: ArrayLike) -> Float[Array, "..."]:
     """Length [...] of the twist ``log(a^-1 b)``, one radian counting as much as one meter.
 
     Errors are reported as rotation and translation apart (``so3.geodesic_distance``); this is the
-    one number for optimization and interpolation.
+    one number for optimization and interpolation. Newton's method near 0 takes ``log`` itself, as
+    said in ``so3.angle``.
     """
     return norm(log(compose(inverse(a), b)))
 

@@ -197,7 +197,8 @@ def angle(rotation: ArrayLike) -> Float[Array, "..."]:
     """Rotation angle [...] in [0, pi] radians of [..., 3, 3]; its derivative at 0 is taken as 0.
 
     2 atan2(|v|, r) of the quaternion (r, v) keeps seven digits in float32 at every angle, where
-    arccos of the trace reads 0 for 0.01 deg; so does its derivative.
+    arccos of the trace reads 0 for 0.01 deg; so does its derivative. For second derivatives near
+    0 take ``log``: the square of an angle whose slope is taken as 0 has no curvature there.
     """
     real, *vector = _quaternion(rows(as_floating(rotation, (3, 3), "rotation")))
     return 2 * jnp.arctan2(norm(from_entries(vector)), real)
