@@ -383,7 +383,7 @@ _as_pytree(LossConfig, STATIC_LOSS)
 @section
 @dataclass(frozen=True)
 class TrainingConfig:
-    """How to train; a run is bounded by ``steps`` or by ``minutes``, exactly one of them.
+    """How to train; a run is bounded by ``steps``, ``minutes`` or ``epochs``, exactly one of them.
 
     Attributes:
       batch_size: samples per step over all devices.
@@ -395,6 +395,8 @@ class TrainingConfig:
       steps: length of the run in steps; the result is then a function of the seed.
       minutes: length of the run in minutes of training, summed over resumes; compiling the step
         does not count.
+      epochs: length of the run in passes over a dataset, which has an end where generated frames
+        have none; rounded up to whole steps.
       seed: every random number of the run follows from it.
       data_seed: shapes and frames follow from this one instead, so that runs with other seeds see
         the same data in the same order; None for ``seed``.
@@ -410,7 +412,7 @@ class TrainingConfig:
         much at once; the numbers are the same to rounding.
     """
 
-    ALTERNATIVES: typing.ClassVar = ("steps", "minutes")
+    ALTERNATIVES: typing.ClassVar = ("steps", "minutes", "epochs")
 
     batch_size: Count = 16
     learning_rate: Positive = 1e-4
@@ -420,6 +422,7 @@ class TrainingConfig:
     weight_decay: NonNegative = 0.0
     steps: Count | None = None
     minutes: Positive | None = None
+    epochs: Positive | None = None
     seed: Seed = 0
     data_seed: Seed | None = None
     steps_per_dispatch: Count = 1
@@ -432,11 +435,10 @@ class TrainingConfig:
     save_memory: bool = True
 
     def __post_init__(self) -> None:
-        if (self.steps is None) == (self.minutes is None):
-            raise CaperError(
-                f"training needs either steps or minutes, got steps={self.steps}, "
-                f"minutes={self.minutes}"
-            )
+        bounds = {name: getattr(self, name) for name in self.ALTERNATIVES}
+        if sum(bound is not None for bound in bounds.values()) != 1:
+            given = ", ".join(f"{name}={bound}" for name, bound in bounds.items())
+            raise CaperError(f"training needs one of steps, minutes and epochs, got {given}")
 
     @property
     def stream(self) -> int:
@@ -498,6 +500,11 @@ class RunConfig:
         if 0 < self.calibration_frames < 2560:
             raise CaperError(
                 f"calibration_frames must be 0 or at least 2560, got {self.calibration_frames}"
+            )
+        if self.training.epochs is not None and self.loader is None:
+            raise CaperError(
+                f"training.epochs = {self.training.epochs} needs a dataset (--data, or a [loader] "
+                "in the configuration): generated frames have no end; give steps or minutes"
             )
         if self.data.num_points != self.network.num_points:
             raise CaperError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -144,11 +144,21 @@ def test_of_alternatives_the_one_named_last_holds(tmp_path):
     assert update(tmp_path, "steps = 100\n", by_time) == TrainingConfig(steps=100)
     got = configuration.override(by_time, "steps=7", "minutes=2.5")
     assert got == TrainingConfig(minutes=2.5)
-    for both in ("steps = 100\nminutes = 2.5\n",):
-        with pytest.raises(CaperError, match="either steps or minutes"):
+    assert configuration.override(by_time, "epochs=250") == TrainingConfig(epochs=250.0)
+    for both in ("steps = 100\nminutes = 2.5\n", "minutes = 2.5\nepochs = 3\n"):
+        with pytest.raises(CaperError, match="one of steps, minutes and epochs"):
             update(tmp_path, both, by_time)
-    with pytest.raises(CaperError, match="either steps or minutes"):
+    with pytest.raises(CaperError, match="one of steps, minutes and epochs"):
         configuration.override(by_time, "minutes=none")
+
+
+def test_epochs_need_a_dataset():
+    by_epochs = configuration.override
+    with pytest.raises(CaperError, match=r"training\.epochs = 3\.0 needs a dataset"):
+        by_epochs(preset("paper", "box"), "training.epochs=3")
+    loader = configuration.LoaderConfig("caper", "box.h5")
+    fed = by_epochs(replace(preset("paper", "box"), loader=loader), "training.epochs=3")
+    assert (fed.training.epochs, fed.training.minutes, fed.training.steps) == (3.0, None, None)
 
 
 def test_a_section_that_may_be_absent(tmp_path):

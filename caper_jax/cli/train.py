@@ -23,7 +23,7 @@ EXAMPLES = (
     ("--category box --from runs/box --minutes 10 --out runs/box2", "goes on from a model"),
     ("--category box --from box --minutes 10 --out runs/mine", "from the one that ships"),
     ("--category laptop --preset paper --steps 1000 --out runs/paper", "as published"),
-    ("--category box --data ROOT --format artimage --out runs/own", "your own data"),
+    ("--category box --data ROOT --format artimage --epochs 250 --out runs/own", "your own data"),
     ("--category box --training.learning-rate 1e-3 --out runs/try", "one setting"),
     ("--category all --from runs/box --minutes 60 --out runs", "each into runs/<category>"),
 )
@@ -61,6 +61,7 @@ class Train:
       minutes: of training (default: the configuration's, or 60); compiling comes before, the fit
         of the refiner and of the standard deviations after
       steps: length in steps instead: reproducible to the bit
+      epochs: length in passes over --data instead; likewise
       seed: of shapes, frames and weights (default: 0)
       init_weight_average: with --from, how much of that model is in the weights that are written
         (default: 0)
@@ -79,6 +80,7 @@ class Train:
     split: str | None = None
     minutes: Positive | None = None
     steps: Count | None = None
+    epochs: Positive | None = None
     seed: Size | None = None
     init_weight_average: float | None = None
     calibration_frames: Size | None = None
@@ -89,8 +91,9 @@ def parse(argv: Sequence[str]) -> Train:
     options, settings = common.parse_with_settings(
         Train, argv, EXAMPLES, Settings(SECTIONS, default_sections)
     )
-    if options.minutes is not None and options.steps is not None:
-        raise CaperError("give either --minutes or --steps")
+    bounds = (options.minutes, options.steps, options.epochs)
+    if sum(bound is not None for bound in bounds) > 1:
+        raise CaperError("give one of --minutes, --steps and --epochs")
     if options.data is None:
         for option in ("format", "split"):
             if getattr(options, option) is not None:
@@ -167,6 +170,7 @@ def _configuration(category: str, options: Train, initial: Path | None) -> RunCo
     given = {
         "training.minutes": options.minutes,
         "training.steps": options.steps,
+        "training.epochs": options.epochs,
         "training.seed": options.seed,
         "init_weight_average": options.init_weight_average,
         "calibration_frames": options.calibration_frames,

@@ -109,6 +109,11 @@ def fit(
       CaperError: the directory holds a run of another configuration or cannot be read, a
         configuration value is out of range, or the loss stays non-finite.
     """
+    if config.epochs is not None:
+        raise CaperError(
+            f"training.epochs = {config.epochs} needs a dataset, which only a whole run has "
+            "(training.train.train); give steps or minutes"
+        )
     if (batch_fn is None) == (batches is None):
         raise ValueError("give either batch_fn or batches")
     if batches is not None and config.steps_per_dispatch != 1:

@@ -23,6 +23,7 @@ from caper_jax.config import (
     PRESETS,
     RefinerConfig,
     RunConfig,
+    TrainingConfig,
     preset,
     to_dict,
 )
@@ -104,9 +105,8 @@ def train(
     run = partial(
         fit,
         directory,
-        config.training,
-        objective,
-        start.variables,
+        loss_fn=objective,
+        variables=start.variables,
         mesh=_mesh(config.training.batch_size),
         description=description,
     )
@@ -231,7 +231,7 @@ def _fit_generated(
     def batch_fn(key, bank):
         return generator.draw(key, batch_size, bank)
 
-    result = run(batch_fn=batch_fn, data=generator.bank)
+    result = run(config=config.training, batch_fn=batch_fn, data=generator.bank)
     return result, lambda: generator.batch(jax.random.key(config.training.stream), SAMPLE)
 
 
@@ -258,7 +258,7 @@ def _fit_dataset(
         prefetch=source.prefetch,
         cache_gib=source.cache_gib,
     ) as loader:
-        result = run(batches=loader)
+        result = run(config=in_steps(config.training, len(dataset)), batches=loader)
 
     def draw_sample() -> Batch:
         size = min(SAMPLE, len(dataset))
@@ -266,6 +266,14 @@ def _fit_dataset(
             return once(0)
 
     return result, draw_sample
+
+
+def in_steps(config: TrainingConfig, frames: int) -> TrainingConfig:
+    """The same training, bounded by steps where it was by epochs of so many frames."""
+    if config.epochs is None:
+        return config
+    steps = math.ceil(config.epochs * frames / config.batch_size)
+    return replace(config, steps=steps, epochs=None)
 
 
 def _mesh(batch_size: int) -> jax.sharding.Mesh | None:

@@ -84,6 +84,14 @@ def test_a_file_feeds_a_run_that_resumes_where_it_was(tmp_path, capsys):
     assert cli.main([*feed, *steps, str(tmp_path / "one")]) == 0
     jax.tree.map(np.testing.assert_array_equal, read_model(tmp_path / "one")[1], variables)
 
+    # Three passes over 7 frames are 7 batches of 3, and the same command ends there again.
+    for _ in range(2):
+        assert cli.main([*feed, "--epochs", "3", "--out", str(tmp_path / "epochs")]) == 0
+    card = read_model(tmp_path / "epochs")[0]
+    assert card["steps"] == 7 and card["run"]["training"]["epochs"] == 3.0
+    assert cli.main([*feed, "--epochs", "3", *steps, str(tmp_path / "epochs")]) == 2
+    assert "one of --minutes, --steps and --epochs" in capsys.readouterr().err
+
     capsys.readouterr()
     assert cli.main([*feed, "--split", "val", *steps, str(tmp_path / "three")]) == 2
     assert "holds split 'train', not 'val'" in capsys.readouterr().err
@@ -290,7 +298,7 @@ def test_a_model_of_another_category_gives_its_encoders():
         (["--trainin.seed=1"], ["'trainin'", "did you mean 'training'"]),
         (["--training.seed"], ["--training.seed needs a value"]),
         (["--set", "category=drawer"], ["'category'", "network"]),
-        (["--minutes=1"], ["--minutes or --steps"]),
+        (["--minutes=1"], ["--minutes, --steps and --epochs"]),
     ],
 )
 def test_what_cannot_be_done_is_said_before_a_run_begins(setting, parts, tmp_path, capsys):

@@ -230,6 +230,13 @@ def test_compiling_is_not_training(tmp_path, monkeypatch):
     assert float(result.state.elapsed) == pytest.approx(30, abs=2)
 
 
+def test_epochs_need_to_know_how_many_frames_there_are(tmp_path):
+    given = config(steps=None, epochs=2.0)
+    with pytest.raises(CaperError, match=r"training\.epochs = 2\.0 needs a dataset"):
+        fit(tmp_path, given, loss_fn, variables(), batches=host_batches())
+    assert not list(tmp_path.iterdir())
+
+
 def test_another_configuration_is_refused_by_key(tmp_path, unkilled):
     def resume(settings, description=None):
         return fit(
