@@ -23,6 +23,7 @@ from caper_jax.lie import so3
 from caper_jax.models.uncertainty import COVERAGE
 from caper_jax.progress import progress
 from caper_jax.synthetic.frames import Generator
+from caper_jax.synthetic.instances import split_key
 from caper_jax.synthetic.sensor import CAMERAS
 from caper_jax.training.objective import where_samples
 
@@ -31,6 +32,7 @@ SPLIT = "val"
 BATCH = 32
 _SMALLEST = 1e-5  # radians or units: below it an error has no logarithm worth fitting
 _ITERATIONS = 200
+_STREAM = 0xCA11B8A7  # of random numbers, besides those of the splits
 
 
 def calibrate(
@@ -118,6 +120,9 @@ def mixed_frames(
     """Batches of generated frames of an estimator's category, by turns as each of ``configs`` has
     them, with as many points as it takes.
 
+    Cameras, states and sensors are drawn apart from those of training, and from the frames that a
+    split and a seed name: what is fitted on these frames can be tested on the others.
+
     Args:
       estimator: whose category it is.
       configs: what the frames suffer from.
@@ -139,7 +144,7 @@ def mixed_frames(
         )
         for config in configs
     ]
-    key = jax.random.key(seed)
+    key = jax.random.fold_in(split_key(split, seed), _STREAM)
     with progress(title, total=frames) as bar:
         for start in range(0, frames, BATCH):
             generator = generators[start // BATCH % len(generators)]
