@@ -139,5 +139,14 @@ class Dense(Weights, nn.Dense):
     dot_general: Any = mixed_precision_dot
 
 
+def block_init(inputs: int, total: int) -> Any:
+    """Initializer of a block of ``inputs`` rows of the kernel of a layer that takes ``total``.
+
+    Blocks of which each were as large as a layer of its own would let a few channels, such as the
+    coordinates, speak as loudly as hundreds.
+    """
+    return nn.initializers.variance_scaling(inputs / total, "fan_in", "truncated_normal")
+
+
 class BatchNorm(Weights, nn.BatchNorm):
     """``nn.BatchNorm``."""

@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from caper_jax import categories
 from caper_jax.config import HSEncoderConfig, preset
 from caper_jax.estimator import estimate
-from caper_jax.models.encoders.hs import HSEncoder, neighborhoods
+from caper_jax.models.encoders.hs import HSEncoder, OutlierRobust, neighborhoods
 from caper_jax.models.parts import PartsNetwork
 from caper_jax.models.root import RootNetwork
 
@@ -90,6 +90,14 @@ def hs_encoder(variables, points, config):
 def shapes_of(module, count):
     streams = {name: jax.random.key(0) for name in ("params", "sample", "dropout")}
     return jax.eval_shape(lambda x: module.init(streams, x, train=False), jnp.zeros((2, count, 3)))
+
+
+def test_the_robust_layer_starts_as_one_layer_on_feature_and_global_feature():
+    around = np.zeros((1, 4, 2), np.int32)
+    features = np.random.default_rng(0).normal(size=(1, 4, 128)).astype(np.float32)
+    params = jax.jit(OutlierRobust().init)(jax.random.key(0), features, around)["params"]
+    for name in ("own", "shared"):
+        np.testing.assert_allclose(np.var(params[name]["kernel"]), 1 / 256, rtol=0.06)
 
 
 @pytest.mark.parametrize("feature_space", [True, False])

@@ -64,6 +64,25 @@ def test_block_dense_is_a_dense_layer_on_the_concatenation(with_points):
     np.testing.assert_allclose(module.apply({"params": params}, features), expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("with_points", [True, False])
+def test_blocks_start_as_one_layer_on_the_concatenation_would(with_points):
+    """Every block's kernel, whatever its own width, has a variance of 1 / all inputs."""
+    features = levels()
+    blocks = concatenated(features)
+    blocks = blocks if with_points else [*blocks[:3], blocks[4]]
+    rows = np.concatenate(blocks, -1)
+    module, dense = BlockDense(4096, with_points), nn.Dense(4096)
+    params = jax.jit(module.init)(jax.random.key(0), features)
+    for name, own in params["params"].items():
+        spread = np.var(own["kernel"]) * rows.shape[-1]
+        np.testing.assert_allclose(spread, 1.0, rtol=0.06, err_msg=name)
+    whole = jax.jit(dense.init)(jax.random.key(1), rows)
+    got, expected = module.apply(params, features), dense.apply(whole, rows)
+    # Of each point, over the channels.
+    np.testing.assert_allclose(np.var(got, -1), np.var(expected, -1), rtol=0.15)
+    np.testing.assert_allclose(np.mean(got, -1), 0.0, atol=0.15)
+
+
 def test_every_takes_every_other_point_of_all_levels():
     features = levels()
     half = features.every(2)

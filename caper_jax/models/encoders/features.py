@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from caper_jax.models.encoders.neighbors import gather
-from caper_jax.models.layers import Dense, mixed_precision_dot
+from caper_jax.models.layers import Dense, block_init, mixed_precision_dot
 
 
 @flax.struct.dataclass
@@ -67,7 +66,8 @@ class BlockDense(nn.Module):
     """A dense layer over the concatenation of all levels at every point, without building it.
 
     Each level is projected at its own resolution and the sums are up-sampled: the same result as
-    concatenating first (paper Sec 5.1.1), for a fraction of the arithmetic.
+    concatenating first (paper Sec 5.1.1), for a fraction of the arithmetic. Its weights start as
+    those of the one layer would.
 
     Attributes:
       width: output channels.
@@ -83,15 +83,24 @@ class BlockDense(nn.Module):
     @nn.compact
     def __call__(self, features: Features) -> Float[Array, "B N C"]:
         """Features -> ``width`` channels at every point."""
-        dense = partial(Dense, self.width, dot_general=self.dot_general)
+        blocks = [level.features for level in features.levels]
+        blocks += [features.points] if self.with_points else []
+        blocks += [features.shared] if features.shared is not None else []
+        channels = sum(block.shape[-1] for block in blocks)
+
+        def dense(rows, name, use_bias=False):
+            start = block_init(rows.shape[-1], channels)
+            layer = Dense(
+                self.width, use_bias, kernel_init=start, dot_general=self.dot_general, name=name
+            )
+            return layer(rows)
+
         total: Any = 0.0
         for number, level in enumerate(features.levels):
-            bias = number == 0
-            part = dense(use_bias=bias, name=f"level{number}")(level.features)
+            part = dense(level.features, f"level{number}", use_bias=number == 0)
             total += level.at_points(part)
         if self.with_points:
-            total += dense(use_bias=False, name="points")(features.points)
+            total += dense(features.points, "points")
         if features.shared is not None:
-            shared = dense(use_bias=False, name="shared")(features.shared)
-            total += shared[:, None, :]
+            total += dense(features.shared, "shared")[:, None, :]
         return total

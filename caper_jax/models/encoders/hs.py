@@ -21,7 +21,14 @@ from caper_jax.models.encoders.neighbors import (
     nearest_row,
     neighbor_max,
 )
-from caper_jax.models.layers import BatchNorm, Dense, Weights, max_over_points, weights_first
+from caper_jax.models.layers import (
+    BatchNorm,
+    Dense,
+    Weights,
+    block_init,
+    max_over_points,
+    weights_first,
+)
 
 dense = partial(Dense, dot_general=weights_first)
 
@@ -47,8 +54,10 @@ class OutlierRobust(nn.Module):
         """Features and each point's neighbors in space -> features."""
         channels = features.shape[-1]
         shared = neighbor_max(features, around).mean(1, keepdims=True)
-        own = dense(channels, use_bias=False, name="own")(features)
-        return features + own + dense(channels, use_bias=False, name="shared")(shared)
+        half = partial(
+            dense, channels, use_bias=False, kernel_init=block_init(channels, 2 * channels)
+        )
+        return features + half(name="own")(features) + half(name="shared")(shared)
 
 
 class HSLayer(Weights, nn.Module):
