@@ -17,6 +17,7 @@ from caper_jax.training import memory
 from caper_jax.training.grid import Group, Streams, with_numbers
 from caper_jax.training.objective import Objective
 from caper_jax.training.optimizer import Optimizer
+from caper_jax.training.statistics import updated_statistics
 from caper_jax.training.step import TrainState, compiler_options, data_key, train_step
 
 PyTree = Any
@@ -41,6 +42,7 @@ class MembersStep:
         self.group = group
         self._mesh = mesh
         self._jitted = self._jit()
+        self._statistics = self._jit_statistics()
         self._compiled: dict[int, Any] = {}
 
     def __call__(
@@ -61,6 +63,12 @@ class MembersStep:
             return 0.0
         own = use.argument_size_in_bytes + use.output_size_in_bytes - use.alias_size_in_bytes
         return (own + use.temp_size_in_bytes) * (1 if self._mesh is None else self._mesh.size)
+
+    def statistics(
+        self, model_state: PyTree, weights: PyTree, seed: Array, step: Array, data: PyTree
+    ) -> PyTree:
+        """Collections [M, ...] of the exported weights, see ``statistics.with_own_statistics``."""
+        return self._statistics(model_state, weights, seed, step, data)
 
     def _program(self, state: TrainState, progress: Any, factor: Any, data: PyTree) -> Any:
         count = progress.shape[0]
@@ -100,21 +108,46 @@ class MembersStep:
                 return state, jax.tree.map(lambda x: x[None], metrics)
             return jax.lax.scan(lambda s, x: one(s, x[0], x[1], data), state, (progress, factor))
 
-        device = jax.local_devices()[0]
-        function: Any = run
-        if self._mesh is not None:
-            device = self._mesh.devices.flat[0]
-            streams = _SPLIT if sharing == "own" else _EVERYWHERE
-            # Custom gradients hide from the check what is the same on all devices.
-            function = jax.shard_map(
-                run,
-                mesh=self._mesh,
-                in_specs=(_SPLIT, _EVERYWHERE, _EVERYWHERE, (streams, _SPLIT, _SPLIT)),
-                out_specs=(_SPLIT, PartitionSpec(None, _AXIS)),
-                check_vma=False,
-            )
-        options = compiler_options(device.platform)
-        return jax.jit(function, donate_argnums=0, compiler_options=options)
+        device = jax.local_devices()[0] if self._mesh is None else self._mesh.devices.flat[0]
+        return jax.jit(
+            self._shared(
+                run, (_SPLIT, _EVERYWHERE, _EVERYWHERE), (_SPLIT, PartitionSpec(None, _AXIS))
+            ),
+            donate_argnums=0,
+            compiler_options=compiler_options(device.platform),
+        )
+
+    def _jit_statistics(self) -> Any:
+        group = self.group
+        config = group.config
+        axis = None if group.sharing == "all" else 0
+
+        def member(model_state, weights, seed, numbers: Metrics, step, batch):
+            own = with_numbers(config, numbers)
+            objective = Objective(group.category, own.network, own.loss)
+            return updated_statistics(model_state, weights, seed, step, batch, objective)
+
+        def run(model_state: PyTree, weights: PyTree, seed: Array, step: Array, data: PyTree):
+            streams, numbers, stream_of = data
+            batch = draw_batches(group, streams, step, stream_of)
+            over_members = jax.vmap(member, in_axes=(0, 0, 0, 0, None, axis))
+            return over_members(model_state, weights, seed, numbers, step, batch)
+
+        return jax.jit(self._shared(run, (_SPLIT, _SPLIT, _SPLIT, _EVERYWHERE), _SPLIT))
+
+    def _shared(self, function: Any, in_specs: tuple[PartitionSpec, ...], out_specs: Any) -> Any:
+        """A function whose last argument is ``group_data``, with its members on all devices."""
+        if self._mesh is None:
+            return function
+        streams = _SPLIT if self.group.sharing == "own" else _EVERYWHERE
+        # Custom gradients hide from the check what is the same on all devices.
+        return jax.shard_map(
+            function,
+            mesh=self._mesh,
+            in_specs=(*in_specs, (streams, _SPLIT, _SPLIT)),
+            out_specs=out_specs,
+            check_vma=False,
+        )
 
 
 def draw_batches(

@@ -29,6 +29,7 @@ from caper_jax.training.run_directory import (
     MetricsLog,
     check_configuration,
 )
+from caper_jax.training.statistics import compile_statistics, with_own_statistics
 from caper_jax.training.step import LossFn, TrainState, compile_step
 
 PyTree = Any
@@ -65,7 +66,8 @@ class FitResult:
     """What `fit` hands back.
 
     Attributes:
-      state: the last training state; ``state.variables`` are the weights to use.
+      state: the last training state; ``state.variables`` are the weights to use. Of a finished run
+        its mutable collections are those of these weights (``training.statistics``).
       finished: whether the budget was used up; False after SIGTERM or Ctrl-C.
     """
 
@@ -149,7 +151,11 @@ def fit(
         path = directory / METRICS_FILE if jax.process_index() == 0 else None
         return MetricsLog(path, step, config.log_steps, config.batch_size, saved)
 
-    return run_steps(directory, config, step_fn, state, batch_of, logs)
+    result = run_steps(directory, config, step_fn, state, batch_of, logs)
+    if not result.finished:
+        return result
+    statistics = compile_statistics(loss_fn, batch_fn, config.data_seed, mesh)
+    return FitResult(with_own_statistics(result.state, statistics, batch_of), finished=True)
 
 
 def run_steps(

@@ -136,7 +136,7 @@ def train_step(
     )
     norm = jnp.sqrt(sum(jnp.sum(jnp.square(g)) for g in jax.tree.leaves(gradients)))
     # The norm is finite only if every gradient is; the model state may break on its own.
-    applied = jnp.isfinite(loss) & jnp.isfinite(norm) & _all_finite(model_state)
+    applied = jnp.isfinite(loss) & jnp.isfinite(norm) & all_finite(model_state)
     params, opt_state = optimizer.update(gradients, state.opt_state, state.params, factor)
 
     def keep(new: PyTree, old: PyTree) -> PyTree:
@@ -151,6 +151,19 @@ def train_step(
         skipped=state.skipped + jnp.where(applied, 0, 1),
     )
     return new, {**metrics, "loss": loss, "gradient_norm": norm, "applied": applied}
+
+
+def draw_batch(
+    key: jax.Array,
+    data: PyTree,
+    batch_fn: Callable[..., PyTree] | None,
+    mesh: jax.sharding.Mesh | None,
+) -> PyTree:
+    """Inside jit: the batch of a step, see ``compile_step``; ``key`` is its data key."""
+    batch = data
+    if batch_fn is not None:
+        batch = batch_fn(key) if data is None else batch_fn(key, data)
+    return batch if mesh is None else parallel.constrain_batch(batch, mesh)
 
 
 def compile_step(
@@ -192,12 +205,8 @@ def compile_step(
         return parallel.each_device(function, mesh)
 
     def one(state: TrainState, progress: jax.Array, factor: jax.Array, data: PyTree):
-        batch = data
-        if batch_fn is not None:
-            key = data_key(state.seed if data_seed is None else data_seed, state.step)
-            batch = batch_fn(key) if data is None else batch_fn(key, data)
-        if mesh is not None:
-            batch = parallel.constrain_batch(batch, mesh)
+        key = data_key(state.seed if data_seed is None else data_seed, state.step)
+        batch = draw_batch(key, data, batch_fn, mesh)
         return train_step(
             state,
             batch,
@@ -242,7 +251,7 @@ def compiler_options(platform: str) -> dict[str, str] | None:
     return _LEAST_MEMORY
 
 
-def _all_finite(tree: PyTree) -> jax.Array:
+def all_finite(tree: PyTree) -> jax.Array:
     """[] bool: every floating-point leaf is finite."""
     flags = [
         jnp.all(jnp.isfinite(x))

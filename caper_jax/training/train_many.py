@@ -32,6 +32,7 @@ from caper_jax.training import grid, grid_step
 from caper_jax.training.grid import Banks, Group, Member
 from caper_jax.training.loop import run_steps
 from caper_jax.training.run_directory import METRICS_FILE, MetricsLog, check_configuration
+from caper_jax.training.statistics import with_own_statistics
 from caper_jax.training.step import TrainState
 from caper_jax.training.train import (
     SAMPLE,
@@ -299,6 +300,7 @@ class _Runner:
         result = run_steps(folder, training, step, state, lambda _: data, make_logs, self.title)
         if not result.finished:
             return False
+        trained = with_own_statistics(result.state, step.statistics, lambda _: data)
         diverged = logs[0].diverged
         samples: dict[Any, Batch] = {}
         for number, (member, start) in enumerate(zip(members, starts, strict=True)):
@@ -310,7 +312,7 @@ class _Runner:
             seen = member.config.data, member.bank
             if seen not in samples:
                 samples[seen] = self._sample(member)
-            last = jax.tree.map(lambda leaf, n=number: leaf[n], result.state)
+            last = jax.tree.map(lambda leaf, n=number: leaf[n], trained)
             write_run(member.config, self.category, own, last, samples[seen], start)
         return True
 

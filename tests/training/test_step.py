@@ -166,8 +166,8 @@ def test_keys_follow_from_seed_and_step_alone():
         jax.random.key_data(key).tobytes()
         for seed in (0, 1)
         for step in range(5)
-        for key in step_keys(jnp.uint32(seed), jnp.int32(step))
+        for key in (data_key(seed, step), loss_key(seed, step))
     }
     assert len(keys) == 20  # no two streams, steps or seeds share one
-    again = step_keys(jnp.uint32(1), jnp.int32(4))[1]
+    again = loss_key(jnp.uint32(1), jnp.int32(4))
     assert jax.random.key_data(again).tobytes() in keys

@@ -15,7 +15,7 @@ from caper_jax.data.types import Batch
 from caper_jax.synthetic import frames
 from caper_jax.synthetic.frames import Generator, articulated_pose, collect_frames
 from caper_jax.training.fit_uncertainty import BATCH, mixed_frames
-from caper_jax.training.step import step_keys
+from caper_jax.training.step import data_key
 
 SEED = 0  # that of published tables and of runs
 CONFIG = GeneratorConfig(instances=4, grid=8, num_points=16, noise=("none",))
@@ -56,7 +56,7 @@ def test_training_calibration_and_test_share_no_draw(monkeypatch):
         return list(mixed_frames(estimator, [CONFIG], split, 4 * BATCH, SEED, "drawing"))
 
     train = Generator(BOX, CONFIG, "train", SEED)
-    steps = [train.batch(step_keys(jnp.uint32(SEED), jnp.int32(n))[0], 16) for n in range(8)]
+    steps = [train.batch(data_key(SEED, n), 16) for n in range(8)]
     drawn = {
         "steps of training": cameras_and_states(steps, "train"),
         **{

@@ -79,7 +79,7 @@ class FastEncoder(nn.Module):
         count = min(count, total)
         places = jnp.arange(count) * total // count
         if config.center_order == "random":
-            places = np.random.default_rng(0).permutation(total)[:count]
+            places = jnp.asarray(np.random.default_rng(0).permutation(total)[:count])
         centers = points[:, places]
         middle = points.mean(axis=1, keepdims=True)
         radius = jnp.sqrt(((points - middle) ** 2).sum(-1).mean(-1) + 1e-8)
