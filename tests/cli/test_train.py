@@ -14,13 +14,15 @@ import jax
 import numpy as np
 import pytest
 from _helpers.frames import random_frames
+from _helpers.tiny import network, random_variables
 
 from caper_jax import categories, cli
-from caper_jax.config import LoaderConfig, NetworkConfig, preset, to_dict
+from caper_jax.config import LoaderConfig, NetworkConfig, override, preset, to_dict
 from caper_jax.data import hdf5
 from caper_jax.errors import CaperError
 from caper_jax.models.files import read_model, write_card, write_model
 from caper_jax.training import train as run
+from caper_jax.training.objective import Objective
 from caper_jax.visualization.plots import training_curves
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -243,6 +245,22 @@ def test_a_run_from_a_model_is_of_the_preset_with_its_encoder(tmp_path, encoder,
         NetworkConfig(encoder=encoder), refine_steps=2, num_points=wanted.data.num_points
     )
     assert config == replace(wanted, network=network)
+
+
+def test_a_model_of_few_points_goes_on_with_more(tmp_path):
+    """No weight depends on their number: most of a run may see a quarter of them."""
+    few = network("hs", num_points=64)
+    category = categories.get("box")
+    card = {"category": "box", "run": {"network": to_dict(few)}}
+    write_model(tmp_path, random_variables(category, few), card)
+    more = ("network.num_points=256", "data.num_points=256")
+    config = override(run.preset_of(tmp_path, "box"), *more)
+    assert config.network == replace(few, num_points=256)
+    assert config.loss == preset("paper").loss and config.training == preset("paper").training
+    template = jax.eval_shape(Objective(category, config.network).init, jax.random.key(0))
+    stored = read_model(tmp_path)[1]
+    start = run.initial_variables(template, stored, tmp_path, same_category=True)
+    jax.tree.map(np.testing.assert_array_equal, start, stored)
 
 
 def test_all_categories_one_after_the_other(model, tmp_path, monkeypatch):
