@@ -108,7 +108,7 @@ class PartsTargets:
 
 
 def stage1_loss(outputs: RootOutput, targets: RootTargets, config: LossConfig) -> Terms:
-    """Losses of stage I: Eqs 17 and 18, and their weighted sum of Eq 22.
+    """Losses of stage I: Eqs 17 and 18, and their weighted sum of Eq 22 without L_se.
 
     Returns:
       {name of a weight: [B]}, and "total" [B].
@@ -125,7 +125,10 @@ def stage1_loss(outputs: RootOutput, targets: RootTargets, config: LossConfig) -
 
 
 def stage2_loss(outputs: PartsOutput, targets: PartsTargets, config: LossConfig) -> Terms:
-    """Losses of stage II: Eqs 19 to 21, and their weighted sum of Eq 23.
+    """Losses of stage II: Eqs 19 to 21, and their weighted sum of Eq 23 with the L_se of Eq 22.
+
+    The paper's tracker is the estimator trained anew, whose stage I then gives increments, learned
+    by L_se (Eq 21). Here stage II gives them, and so has the term.
 
     Of a reference that is off by a cube rotation only that rotation and the increment are learned:
     every other target would have to be rotated with it.
