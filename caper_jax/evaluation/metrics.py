@@ -1,20 +1,23 @@
 """Errors of estimated poses, frame by frame, as the conventions define them.
 
-Everything is computed in float64; rotations by the atan2 form, so that the ground truth scored
-against itself scores 0 degrees, 0 meters and an IoU of 1.
+The formulas stand once, in ``unchecked_pose_errors``, a pure function in the precision of its
+inputs. ``pose_errors`` checks what it is given and computes in float64. Rotations go by the atan2
+form, so that the ground truth scored against itself scores 0 degrees, 0 meters and an IoU of 1.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from caper_jax.articulation.category import Category
-from caper_jax.articulation.pose import ArticulatedPose
+from caper_jax.articulation.pose import Array, ArticulatedPose
 from caper_jax.articulation.symmetry import apply_symmetry, is_ambiguous
 from caper_jax.data.types import pose_shapes
 from caper_jax.errors import CaperError
@@ -35,29 +38,29 @@ FAILURE_VALUES = {
 }
 
 
-@dataclass(frozen=True)
+@flax.struct.dataclass
 class PoseErrors:
-    """Errors of F frames.
+    """Errors of frames; ``*frames`` are any leading axes, numpy's or JAX's arrays.
 
     Attributes:
-      rotation_deg: [F, K] geodesic angle, never folded.
-      translation_m: [F, K] distance of the part origins.
-      translation_relative: [F, K] the same over the true ``object_diagonal``.
-      iou_full: [F, K] IoU of the oriented boxes in the camera frame.
-      iou_size: [F, K] IoU of the boxes' sizes alone, as if they shared center and rotation.
-      axis_deg: [F, J] angle of the joint axes in the root's frame; the sign counts.
-      pivot_m: [F, J] distance of the estimated pivot from the true axis; NaN for prismatic joints.
-      state: [F, J] degrees (revolute) or meters (prismatic).
+      rotation_deg: geodesic angle, never folded.
+      translation_m: distance of the part origins.
+      translation_relative: the same over the true ``object_diagonal``.
+      iou_full: IoU of the oriented boxes in the camera frame.
+      iou_size: IoU of the boxes' sizes alone, as if they shared center and rotation.
+      axis_deg: angle of the joint axes in the root's frame; the sign counts.
+      pivot_m: distance of the estimated pivot from the true axis; NaN for prismatic joints.
+      state: degrees (revolute) or meters (prismatic).
     """
 
-    rotation_deg: Float[np.ndarray, "frames parts"]
-    translation_m: Float[np.ndarray, "frames parts"]
-    translation_relative: Float[np.ndarray, "frames parts"]
-    iou_full: Float[np.ndarray, "frames parts"]
-    iou_size: Float[np.ndarray, "frames parts"]
-    axis_deg: Float[np.ndarray, "frames joints"]
-    pivot_m: Float[np.ndarray, "frames joints"]
-    state: Float[np.ndarray, "frames joints"]
+    rotation_deg: Float[Array, "*frames K"]
+    translation_m: Float[Array, "*frames K"]
+    translation_relative: Float[Array, "*frames K"]
+    iou_full: Float[Array, "*frames K"]
+    iou_size: Float[Array, "*frames K"]
+    axis_deg: Float[Array, "*frames J"]
+    pivot_m: Float[Array, "*frames J"]
+    state: Float[Array, "*frames J"]
 
 
 PART_METRICS = ("rotation_deg", "translation_m", "translation_relative", "iou_full", "iou_size")
@@ -81,27 +84,7 @@ def pose_errors(
     Raises:
       CaperError: estimates of other shapes than the truth, or not finite although not failed.
     """
-    none = np.zeros(len(truth.rotation), bool)
-    failed = none if failed is None else np.asarray(failed, bool)
-    true = _as_double(truth, "truth", category, none)
-    guess = _as_double(estimate, "estimate", category, failed)
-
-    with jax.enable_x64(True):
-        errors = {key: np.array(value) for key, value in _errors(guess, true).items()}
-    revolute = np.array([kind == "revolute" for kind in category.joint_types], bool)
-    errors["pivot_m"][:, ~revolute] = np.nan
-    errors["state"][:, revolute] = np.degrees(errors["state"][:, revolute])
-
-    for key in ("rotation_deg", "axis_deg"):
-        errors[key][failed] = FAILED_ROTATION_DEG
-    for key in ("iou_full", "iou_size"):
-        errors[key][failed] = 0.0
-    errors["translation_m"][failed] = np.linalg.norm(true["translation"], axis=-1)[failed]
-    errors["pivot_m"][failed] = np.where(revolute, _axis_distance(true), np.nan)[failed]
-    widths = np.array([joint.limits[1] - joint.limits[0] for joint in category.joints])
-    errors["state"][failed] = np.where(revolute, np.degrees(widths), widths)
-    errors["translation_relative"] = errors["translation_m"] / object_diagonal(truth)[:, None]
-    return PoseErrors(**errors)
+    return _in_float64(_errors_jitted, estimate, truth, category, failed)
 
 
 def pose_errors_up_to_symmetry(
@@ -118,20 +101,7 @@ def pose_errors_up_to_symmetry(
 
     Args and errors as for ``pose_errors``.
     """
-    truths = [truth, *(apply_symmetry(truth, s, category) for s in category.symmetries)]
-    errors = [pose_errors(estimate, one, category, failed) for one in truths]
-    angles = [error.rotation_deg[:, 0] for error in errors]
-    for number, symmetry in enumerate(category.symmetries, start=1):
-        alike = np.asarray(is_ambiguous(np.asarray(truth.size), symmetry))
-        angles[number] = np.where(alike, angles[number], np.inf)
-    best = np.argmin(angles, axis=0)
-    frames = np.arange(len(best))
-    return PoseErrors(
-        **{
-            field.name: np.stack([getattr(error, field.name) for error in errors])[best, frames]
-            for field in fields(PoseErrors)
-        }
-    )
+    return _in_float64(_errors_up_to_symmetry_jitted, estimate, truth, category, failed)
 
 
 def object_diagonal(pose: ArticulatedPose) -> Float[np.ndarray, " frames"]:
@@ -140,50 +110,130 @@ def object_diagonal(pose: ArticulatedPose) -> Float[np.ndarray, " frames"]:
     return boxes.rest_diagonal(size, center)
 
 
-@jax.jit
-def _errors(guess: dict[str, jax.Array], true: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """All metrics but the failures; states and angles in radians where the joint is revolute."""
-    rotation = so3.geodesic_distance(guess["rotation"], true["rotation"])
+def unchecked_pose_errors(
+    estimate: ArticulatedPose,
+    truth: ArticulatedPose,
+    category: Category,
+    failed: Bool[Array, "*frames"] | None = None,
+) -> PoseErrors:
+    """``pose_errors`` as a pure function: jit, vmap and shard it at will.
+
+    Args:
+      estimate: arrays [..., K, ...]; failed ones may hold anything, NaN too.
+      truth: arrays [..., K, ...]; its precision is that of the errors.
+      category: static.
+      failed: [...] bool.
+    """
+    revolute = np.array([kind == "revolute" for kind in category.joint_types], bool)
+    rotation = so3.geodesic_distance(estimate.rotation, truth.rotation)
     full = boxes.iou_full(
-        guess["rotation"],
-        _box_center(guess),
-        guess["size"],
-        true["rotation"],
-        _box_center(true),
-        true["size"],
+        estimate.rotation,
+        _box_center(estimate),
+        estimate.size,
+        truth.rotation,
+        _box_center(truth),
+        truth.size,
     )
-    sine = linalg.norm(jnp.cross(guess["joint_axis"], true["joint_axis"]))
-    cosine = jnp.sum(guess["joint_axis"] * true["joint_axis"], -1)
-    offset = guess["joint_pivot"] - true["joint_pivot"]
-    return {
+    sine = linalg.norm(jnp.cross(estimate.joint_axis, truth.joint_axis))
+    cosine = jnp.sum(estimate.joint_axis * truth.joint_axis, -1)
+    offset = estimate.joint_pivot - truth.joint_pivot
+    state = jnp.abs(estimate.joint_state - truth.joint_state)
+    distance = linalg.norm(estimate.translation - truth.translation)
+    errors = {
         "rotation_deg": jnp.degrees(rotation),
-        "translation_m": linalg.norm(guess["translation"] - true["translation"]),
+        "translation_m": distance,
         "iou_full": full,
-        "iou_size": boxes.iou_size(guess["size"], true["size"]),
+        "iou_size": boxes.iou_size(estimate.size, truth.size),
         "axis_deg": jnp.degrees(jnp.arctan2(sine, cosine)),
-        "pivot_m": linalg.norm(jnp.cross(offset, true["joint_axis"])),
-        "state": jnp.abs(guess["joint_state"] - true["joint_state"]),
+        "pivot_m": linalg.norm(jnp.cross(offset, truth.joint_axis)),
+        "state": jnp.where(revolute, jnp.degrees(state), state),
     }
+    if failed is not None:
+        widths = np.array([joint.limits[1] - joint.limits[0] for joint in category.joints])
+        worst: dict[str, Any] = {
+            "rotation_deg": FAILED_ROTATION_DEG,
+            "translation_m": linalg.norm(truth.translation),
+            "iou_full": 0.0,
+            "iou_size": 0.0,
+            "axis_deg": FAILED_ROTATION_DEG,
+            "pivot_m": _axis_distance(truth),
+            "state": np.where(revolute, np.degrees(widths), widths).astype(state.dtype),
+        }
+        errors = {
+            key: jnp.where(failed[..., None], worst[key], value) for key, value in errors.items()
+        }
+    errors["pivot_m"] = jnp.where(revolute, errors["pivot_m"], jnp.nan)
+    diagonal = boxes.rest_diagonal(truth.size, truth.box_center)
+    return PoseErrors(translation_relative=errors["translation_m"] / diagonal[..., None], **errors)
 
 
-def _box_center(arrays: dict[str, jax.Array]) -> jax.Array:
+def unchecked_errors_up_to_symmetry(
+    estimate: ArticulatedPose,
+    truth: ArticulatedPose,
+    category: Category,
+    failed: Bool[Array, "*frames"] | None = None,
+) -> PoseErrors:
+    """``pose_errors_up_to_symmetry`` as a pure function, as ``unchecked_pose_errors``."""
+    if not category.symmetries:
+        return unchecked_pose_errors(estimate, truth, category, failed)
+    nearest = truth
+    least = so3.geodesic_distance(estimate.rotation[..., 0, :, :], truth.rotation[..., 0, :, :])
+    for symmetry in category.symmetries:
+        other = apply_symmetry(truth, symmetry, category)
+        angle = so3.geodesic_distance(estimate.rotation[..., 0, :, :], other.rotation[..., 0, :, :])
+        nearer = is_ambiguous(truth.size, symmetry) & (angle < least)
+        least = jnp.where(nearer, angle, least)
+        nearest = jax.tree.map(partial(_choose, nearer), other, nearest)
+    if failed is not None:  # they count against the truth itself
+        nearest = jax.tree.map(partial(_choose, failed), truth, nearest)
+    return unchecked_pose_errors(estimate, nearest, category, failed)
+
+
+_errors_jitted = jax.jit(unchecked_pose_errors, static_argnames="category")
+_errors_up_to_symmetry_jitted = jax.jit(unchecked_errors_up_to_symmetry, static_argnames="category")
+
+
+def _choose(chosen: jax.Array, one: Any, other: Any) -> jax.Array:
+    """``one`` in the chosen frames [...], ``other`` in the rest."""
+    return jnp.where(chosen.reshape(chosen.shape + (1,) * (one.ndim - chosen.ndim)), one, other)
+
+
+def _box_center(pose: ArticulatedPose) -> jax.Array:
     """[..., K, 3] centers of the parts' boxes in the camera frame."""
-    return linalg.apply(arrays["rotation"], arrays["box_center"]) + arrays["translation"]
+    return linalg.apply(pose.rotation, pose.box_center) + pose.translation
 
 
-def _axis_distance(arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """[F, J] meters from the camera to the joint axes, which rest in the root's frame."""
-    root = arrays["rotation"][:, None, 0]
-    axis = np.einsum("fjab,fjb->fja", root, arrays["joint_axis"])
-    pivot = np.einsum("fjab,fjb->fja", root, arrays["joint_pivot"])
-    pivot += arrays["translation"][:, None, 0]
-    return np.linalg.norm(np.cross(pivot, axis), axis=-1)
+def _axis_distance(pose: ArticulatedPose) -> jax.Array:
+    """[..., J] meters from the camera to the joint axes, which rest in the root's frame."""
+    root = pose.rotation[..., :1, :, :]
+    pivot = linalg.apply(root, pose.joint_pivot) + pose.translation[..., :1, :]
+    return linalg.norm(jnp.cross(pivot, linalg.apply(root, pose.joint_axis)))
+
+
+def _in_float64(
+    function: Any,
+    estimate: ArticulatedPose,
+    truth: ArticulatedPose,
+    category: Category,
+    failed: np.ndarray | None,
+) -> PoseErrors:
+    """What a jitted form of the unchecked errors gives in float64, as numpy arrays.
+
+    Raises:
+      CaperError: see ``pose_errors``.
+    """
+    none = np.zeros(len(truth.rotation), bool)
+    failed = none if failed is None else np.asarray(failed, bool)
+    true = _as_double(truth, "truth", category, none)
+    guess = _as_double(estimate, "estimate", category, failed)
+    with jax.enable_x64(True):
+        return jax.device_get(function(guess, true, category=category, failed=failed))
 
 
 def _as_double(
     pose: ArticulatedPose, name: str, category: Category, failed: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Fields [F, ...] in float64; failed frames get a harmless pose, which is not used."""
+) -> ArticulatedPose:
+    """Arrays [F, ...] in float64; failed frames get a harmless pose, which is not used."""
     arrays = {}
     for key, shape in pose_shapes(category.num_parts).items():
         array = np.array(getattr(pose, key), np.float64)
@@ -195,4 +245,4 @@ def _as_double(
         if not np.isfinite(array).all():
             raise CaperError(f"{name} {key} has NaN or infinite entries")
         arrays[key] = array
-    return arrays
+    return ArticulatedPose(**arrays)
