@@ -23,6 +23,7 @@ from .data.readers.base import DatasetReader
 from .data.types import Batch, Frame
 from .errors import CaperError
 from .estimator import Estimator, Prediction, estimate, load
+from .evaluation.batches import evaluate_models
 from .evaluation.metrics import pose_errors
 from .evaluation.protocol import evaluate
 from .export import export_estimator
@@ -80,6 +81,7 @@ __all__ = [
     "encoders",
     "estimate",
     "evaluate",
+    "evaluate_models",
     "export_estimator",
     "forward_kinematics",
     "geometry",

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from caper_jax.cli import common
-from caper_jax.cli.common import Count, Positive
+from caper_jax.cli.common import Count, Positive, Size
 from caper_jax.errors import CaperError
 
 if TYPE_CHECKING:
@@ -18,10 +18,12 @@ if TYPE_CHECKING:
     from caper_jax.evaluation.protocol import Evaluation, Predictor
 
 WORST_FILE = "worst.png"
+_OF_DATA = ("format", "split", "official_split", "frames")
 EXAMPLES = (
     ("--category box --data ReArtMix --format reartmix --out outputs/box", "real frames"),
     ("--category box --data box_test.h5 --out outputs/box", "generated"),
     ("--category box --data box_test.h5 --worst 6 --out outputs/box", "see why"),
+    ("--category box --generate 1000 --out outputs/box", "generated as it goes, no file"),
 )
 
 
@@ -34,8 +36,11 @@ class Evaluate:
 
     Attributes:
       category: e.g. box, or FILE.py:NAME for one of your own
-      data: dataset's root folder or .h5
       out: folder for the results
+      data: dataset's root folder or .h5
+      generate: instead of --data, so many generated frames of instances that training never saw
+      noise: of the generated depth
+      seed: of the generated frames and instances
       format: layout of the data: artimage, caper, captra, pm-videos, reart-videos or reartmix
       split: split to read (default: all there is)
       official_split: tell train from test by the published object ids, not by the lists of the
@@ -51,8 +56,11 @@ class Evaluate:
     """
 
     category: str
-    data: Path
     out: Path
+    data: Path | None = None
+    generate: Count | None = None
+    noise: Literal["none", "gauss3mm", "kinect", "realsense"] = "kinect"
+    seed: Size = 0
     format: str = "caper"
     split: str | None = None
     official_split: bool = False
@@ -66,6 +74,12 @@ class Evaluate:
 
 def parse(argv: Sequence[str]) -> Evaluate:
     options = common.parse(Evaluate, argv, EXAMPLES)
+    if (options.data is None) == (options.generate is None):
+        raise CaperError("give either --data or --generate, how many frames to draw")
+    for name in ("noise", "seed") if options.data is not None else _OF_DATA:
+        if getattr(options, name) != getattr(Evaluate, name):
+            other = "--generate" if options.data is not None else "--data"
+            raise CaperError(f"{common.flag(Evaluate, name)} goes with {other}")
     if options.worst and options.predictor != "model":
         raise CaperError("--worst shows what the model estimates; leave out --predictor")
     common.check_folder(options.out, "--out")
@@ -75,14 +89,11 @@ def parse(argv: Sequence[str]) -> Evaluate:
 def run(options: Evaluate) -> int:
     """Runs the command; returns its exit code."""
     from caper_jax import categories
-    from caper_jax.data.readers import open_dataset
     from caper_jax.evaluation import protocol, report
 
     category = categories.get(options.category)
-    dataset = open_dataset(
-        options.format, options.data, category.name, options.split, options.official_split
-    )
-    predictor: protocol.Predictor = protocol.truth_predictor
+    dataset = _dataset(options, category)
+    predictor: Estimator | Predictor = protocol.truth_predictor
     estimator = weights = None
     if options.predictor != "truth":
         estimator, predictor, weights = _predictor(options, category)
@@ -99,7 +110,33 @@ def run(options: Evaluate) -> int:
     return 0
 
 
-def _predictor(options: Evaluate, category: Category) -> tuple[Estimator, Predictor, str]:
+def _dataset(options: Evaluate, category: Category) -> Dataset:
+    """The frames to evaluate on.
+
+    Raises:
+      CaperError: see ``open_dataset``; a category that cannot be drawn.
+    """
+    from caper_jax.data.readers import open_dataset
+
+    if options.data is not None:
+        return open_dataset(
+            options.format, options.data, category.name, options.split, options.official_split
+        )
+    from caper_jax.reproduce.data import FRAME_DATA
+    from caper_jax.reproduce.options import SPLIT
+    from caper_jax.synthetic.dataset import GeneratedDataset
+    from caper_jax.synthetic.frames import Generator
+
+    assert options.generate is not None
+    generator = Generator(
+        category, replace(FRAME_DATA, noise=(options.noise,)), SPLIT, options.seed
+    )
+    return GeneratedDataset(generator, options.generate, options.seed)
+
+
+def _predictor(
+    options: Evaluate, category: Category
+) -> tuple[Estimator, Estimator | Predictor, str]:
     """The estimator, what it (or its training set's mean) predicts with, and which model it is.
 
     Raises:
@@ -113,7 +150,7 @@ def _predictor(options: Evaluate, category: Category) -> tuple[Estimator, Predic
     if options.predictor == "model":
         if options.camera_roll:
             weights += f", told of a camera roll of {options.camera_roll:g} deg"
-        return estimator, protocol.model_predictor(estimator), weights
+        return estimator, estimator, weights
     if "mean_pose" not in estimator.card:
         raise CaperError(f"model {weights}: its card has no mean_pose; choose another model")
     mean = protocol.mean_predictor(category, estimator.card["mean_pose"], weights)
@@ -130,7 +167,7 @@ def _write_worst(
     """
     import numpy as np
 
-    from caper_jax.evaluation.protocol import NUM_POINTS, cloud_of
+    from caper_jax.evaluation.loading import cloud_of
     from caper_jax.lie import so3
     from caper_jax.models import plausibility
     from caper_jax.visualization.picture import write_picture
@@ -148,7 +185,7 @@ def _write_worst(
     for index in order:
         frame = dataset[index]
         print(f"  {off[index]:6.1f} deg  {frame.name}")
-        prediction = estimator(cloud_of(frame, NUM_POINTS))
+        prediction = estimator(cloud_of(frame, estimator.network.num_points))
         shown = prediction.points, prediction.labels, prediction.pose
         doubt = plausibility.implausible_because(prediction, dataset.category)
         scenes.append(Scene.of_frame(frame, dataset.category, *shown, warning=doubt))

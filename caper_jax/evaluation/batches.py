@@ -8,13 +8,14 @@ frames.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
+from functools import partial, reduce
+from operator import and_
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Bool
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
@@ -59,10 +60,10 @@ def frame_errors(
     return compute(pose, batch.pose, category, ~is_finite(pose))
 
 
-def is_finite(pose: ArticulatedPose) -> Bool[Array, " B"]:
-    """[B]: whether all numbers of each pose [B, ...] are finite."""
-    leaves = [jnp.isfinite(leaf).reshape(len(leaf), -1).all(-1) for leaf in jax.tree.leaves(pose)]
-    return jnp.stack(leaves).all(0)
+def is_finite(pose: ArticulatedPose) -> Bool[Any, " B"]:
+    """[B]: whether all numbers of each pose [B, ...] are finite; numpy or JAX's arrays."""
+    leaves = jax.tree.leaves(pose)
+    return reduce(and_, ((abs(leaf) < np.inf).reshape(len(leaf), -1).all(-1) for leaf in leaves))
 
 
 def evaluate_models(

@@ -1,34 +1,67 @@
-"""Runs a predictor over a dataset: what it is given, in which batches, and what counts."""
+"""Estimates every frame of a dataset or of a generator, and measures how far off each is."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from functools import partial
+from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Bool, Float
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.kinematics import forward_kinematics
-from caper_jax.articulation.pose import ArticulatedPose
-from caper_jax.data.clouds import sample_points, shows_object
-from caper_jax.data.types import Dataset, Frame, pose_problems, pose_shapes
+from caper_jax.articulation.pose import Array, ArticulatedPose
+from caper_jax.data.types import Dataset, Frame, pose_shapes
 from caper_jax.errors import CaperError
-from caper_jax.estimator import Prediction
+from caper_jax.estimator import Estimator, Prediction
+from caper_jax.evaluation.batches import is_finite
+from caper_jax.evaluation.loading import FrameBatch, frame_batches, stack
+from caper_jax.evaluation.metrics import (
+    PoseErrors,
+    pose_errors,
+    pose_errors_up_to_symmetry,
+    unchecked_errors_up_to_symmetry,
+    unchecked_pose_errors,
+)
 from caper_jax.lie import se3
 from caper_jax.progress import progress
+from caper_jax.synthetic.dataset import GeneratedDataset
+from caper_jax.synthetic.frames import Generator
+from caper_jax.training.parallel import DATA_AXIS, data_mesh
 
-BATCH_SIZE = 16
+BATCH_SIZE = 32
 NUM_POINTS = 1024
-Tree = TypeVar("Tree")
 
 # Poses [B, K, ...] for B frames and their clouds [B, N, 3], meters; or predictions with a ``pose``,
 # which may also say whether they are ``plausible``.
 Predictor = Callable[[Sequence[Frame], np.ndarray], ArticulatedPose | Prediction]
+
+
+@flax.struct.dataclass
+class Estimates:
+    """Estimates of F frames and their errors; numpy arrays, or JAX's within a program.
+
+    Attributes:
+      pose: arrays [F, K, ...]; NaN where ``failed``.
+      failed: too few points, or an estimate that is not finite.
+      plausible: what the predictor says of its estimates, False where ``failed``; None where it
+        says nothing.
+      errors: against the truth; ``metrics.FAILURE_VALUES`` where ``failed``.
+      symmetric_errors: the same up to the category's declared symmetries; None where it has none.
+    """
+
+    pose: ArticulatedPose
+    failed: Bool[Array, " F"]
+    plausible: Bool[Array, " F"] | None
+    errors: PoseErrors
+    symmetric_errors: PoseErrors | None
 
 
 @dataclass(frozen=True)
@@ -39,11 +72,10 @@ class Evaluation:
       names: F names.
       estimate: arrays [F, K, ...]; NaN where ``failed``.
       truth: arrays [F, K, ...].
-      failed: [F] bool: too few points, or an estimate that is not finite.
-      plausible: [F] bool: what the predictor says of its estimates, False where ``failed``; None
-        where it says nothing.
+      failed, plausible, errors, symmetric_errors: see ``Estimates``.
       visibility: [F, K] share of each part that nothing hides; NaN where the data do not say.
-      seconds_per_frame: time of the predictor alone, after a first call that compiles.
+      seconds_per_frame: time of the predictor, after a first call that compiles; of an
+        ``Estimator``, the errors' included.
     """
 
     names: list[str]
@@ -51,75 +83,190 @@ class Evaluation:
     truth: ArticulatedPose
     failed: Bool[np.ndarray, " frames"]
     plausible: Bool[np.ndarray, " frames"] | None
+    errors: PoseErrors
+    symmetric_errors: PoseErrors | None
     visibility: Float[np.ndarray, "frames parts"]
     seconds_per_frame: float
 
 
 def evaluate(
-    dataset: Dataset,
-    predictor: Predictor,
-    limit: int | None = None,
+    data: Dataset | Generator,
+    estimator: Estimator | Predictor,
+    frames: int | None = None,
     batch_size: int = BATCH_SIZE,
-    num_points: int = NUM_POINTS,
+    num_points: int | None = None,
+    seed: int = 0,
+    devices: Sequence[jax.Device] | None = None,
 ) -> Evaluation:
-    """Estimates every frame, in batches of one fixed shape so that nothing compiles twice.
+    """Estimates frames and measures the errors, in batches of one shape.
+
+    An ``Estimator`` and the errors of what it says run as one program on the device, in float32,
+    batches split over all devices; the errors of a predictor's poses are computed in float64 on
+    the host. Meanwhile threads read and sample the next frames. Errors are kept per frame, so that
+    no figure depends on batches or devices but for the rounding of the networks.
 
     Args:
-      dataset: labeled frames.
-      predictor: e.g. ``model_predictor(estimator)``.
-      limit: at most so many frames, from the first.
-      batch_size: frames per call; the last batch is filled up with copies.
-      num_points: points per cloud.
+      data: labeled frames, or what draws them.
+      estimator: the model, or any predictor, e.g. ``truth_predictor``.
+      frames: at most so many, from the first; of a generator, how many to draw.
+      batch_size: frames per call; made a multiple of the number of devices. The last batch is
+        filled up with copies, which do not count.
+      num_points: points per cloud that a predictor sees, 1024 by default; an ``Estimator`` sees as
+        many as its networks take.
+      seed: of a generator's frames, which are those that ``caper generate`` writes for it.
+      devices: that an ``Estimator`` runs on; all of this process by default.
 
     Raises:
-      CaperError: no frames, or frames without (or with broken) ground truth.
+      CaperError: no frames, frames without (or with broken) ground truth, or of another category
+        than the estimator's.
     """
-    count = len(dataset) if limit is None else min(limit, len(dataset))
+    dataset = _frames_of(data, frames, seed)
+    count = len(dataset) if frames is None else min(frames, len(dataset))
     if count <= 0:
-        raise CaperError(f"nothing to evaluate: {len(dataset)} frames, limit {limit}")
+        raise CaperError(f"nothing to evaluate: {len(dataset)} frames, {frames} wanted")
+    category = dataset.category
+    if isinstance(estimator, Estimator):
+        if estimator.category.name != category.name:
+            raise CaperError(
+                f"the frames show {category.name!r}, the model estimates "
+                f"{estimator.category.name!r}"
+            )
+        mesh = data_mesh(jax.local_devices() if devices is None else devices)
+        batch_size = -(-batch_size // mesh.size) * mesh.size
+        num_points = estimator.network.num_points
+        step: Any = _EstimatorStep(estimator, category, mesh)
+    else:
+        step = _PredictorStep(estimator, category)
+    # Where there are more batches to time, none is estimated twice.
+    again = count <= batch_size or not isinstance(estimator, Estimator)
+    parts: list[Estimates] = []
     names: list[str] = []
-    estimates: list[ArticulatedPose] = []
     truths: list[ArticulatedPose] = []
     visibility: list[np.ndarray] = []
-    verdicts: list[np.ndarray] = []
-    unknown = np.full(dataset.category.num_parts, np.nan)
-    seconds = 0.0
+    unknown = np.full(category.num_parts, np.nan)
+    seconds = []
     with progress("evaluating", total=count) as bar:
-        for start in range(0, count, batch_size):
-            frames = [dataset[i] for i in range(start, min(start + batch_size, count))]
-            padded = frames + [frames[-1]] * (batch_size - len(frames))
-            clouds = np.stack([cloud_of(frame, num_points) for frame in padded])
-            if start == 0:
-                predictor(padded, clouds)  # compiles
-            began = time.perf_counter()
-            batch: Any = jax.block_until_ready(predictor(padded, clouds))
-            seconds += time.perf_counter() - began
-            if (plausible := getattr(batch, "plausible", None)) is not None:
-                verdicts.append(np.asarray(plausible)[: len(frames)])
-            batch = jax.tree.map(np.asarray, getattr(batch, "pose", batch))
-            names += [frame.name for frame in frames]
-            truths += [_truth(frame, dataset.category) for frame in frames]
-            visibility += [unknown if f.visibility is None else f.visibility for f in frames]
-            for i, frame in enumerate(frames):
-                pose = jax.tree.map(lambda array, i=i: array[i], batch)
-                estimates.append(_checked(pose, frame, dataset.category))
-            bar.update(len(frames))
-    estimate, truth = stack(estimates), stack(truths)
-    failed = np.isnan(estimate.rotation).any((-1, -2, -3))
-    batches = -(-count // batch_size)
+        for batch in frame_batches(dataset, count, batch_size, num_points or NUM_POINTS):
+            if not parts:
+                found = jax.block_until_ready(step.predict(batch))  # compiles
+            if parts or again:
+                began = time.perf_counter()
+                found = jax.block_until_ready(step.predict(batch))
+                seconds.append(time.perf_counter() - began)
+            estimates, truth = step.finish(batch, found), batch.truth
+            if batch.count < batch_size:
+                estimates, truth = jax.tree.map(lambda a, n=batch.count: a[:n], (estimates, truth))
+            parts.append(estimates)
+            truths.append(truth)
+            shown = batch.frames[: batch.count]
+            names += [frame.name for frame in shown]
+            visibility += [unknown if f.visibility is None else f.visibility for f in shown]
+            bar.update(batch.count)
+    whole = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
     return Evaluation(
         names=names,
-        estimate=estimate,
-        truth=truth,
-        failed=failed,
-        plausible=np.concatenate(verdicts) & ~failed if verdicts else None,
+        estimate=whole.pose,
+        truth=jax.tree.map(lambda *arrays: np.concatenate(arrays), *truths),
+        failed=whole.failed,
+        plausible=whole.plausible,
+        errors=whole.errors,
+        symmetric_errors=whole.symmetric_errors,
         visibility=np.stack(visibility),
-        seconds_per_frame=seconds / (batches * batch_size),
+        seconds_per_frame=sum(seconds) / (len(seconds) * batch_size),
+    )
+
+
+def _frames_of(data: Dataset | Generator, frames: int | None, seed: int) -> Dataset:
+    if not isinstance(data, Generator):
+        return data
+    if frames is None:
+        raise CaperError("a generator never ends: say how many frames=")
+    return GeneratedDataset(data, frames, seed)
+
+
+class _EstimatorStep:
+    """Estimates and errors as one program, each device on its own rows."""
+
+    def __init__(self, estimator: Estimator, category: Category, mesh: Mesh) -> None:
+        self._variables = estimator.variables
+        self._static = {"function": estimator.function, "category": category, "mesh": mesh}
+
+    def predict(self, batch: FrameBatch) -> Estimates:
+        truth = jax.tree.map(np.float32, batch.truth)
+        return _estimated(self._variables, batch.points, truth, batch.shown, **self._static)
+
+    def finish(self, batch: FrameBatch, found: Estimates) -> Estimates:
+        return jax.device_get(found)
+
+
+def _estimated_rows(variables, points, truth, shown, function, category) -> Estimates:
+    prediction = function(variables, points)
+    failed = ~(shown & is_finite(prediction.pose))
+    arguments = prediction.pose, truth, category, failed
+    symmetric = unchecked_errors_up_to_symmetry(*arguments) if category.symmetries else None
+    return Estimates(
+        pose=_without(prediction.pose, failed),
+        failed=failed,
+        plausible=prediction.plausible & ~failed,
+        errors=unchecked_pose_errors(*arguments),
+        symmetric_errors=symmetric,
+    )
+
+
+@partial(jax.jit, static_argnames=("function", "category", "mesh"))
+def _estimated(variables, points, truth, shown, function, category, mesh) -> Estimates:
+    rows = partial(_estimated_rows, function=function, category=category)
+    if mesh.size == 1:
+        return rows(variables, points, truth, shown)
+    everywhere, split = PartitionSpec(), PartitionSpec(DATA_AXIS)
+    # Frames do not see one another, so nothing crosses between devices.
+    return jax.shard_map(
+        rows,
+        mesh=mesh,
+        in_specs=(everywhere, split, split, split),
+        out_specs=split,
+        check_vma=False,
+    )(variables, points, truth, shown)
+
+
+class _PredictorStep:
+    """Poses by any function, and their errors in float64."""
+
+    def __init__(self, predictor: Predictor, category: Category) -> None:
+        self._predictor = predictor
+        self._category = category
+
+    def predict(self, batch: FrameBatch) -> ArticulatedPose | Prediction:
+        return self._predictor(batch.frames, batch.points)
+
+    def finish(self, batch: FrameBatch, found: Any) -> Estimates:
+        plausible = getattr(found, "plausible", None)
+        pose = jax.tree.map(np.asarray, getattr(found, "pose", found))
+        failed = ~(batch.shown & is_finite(pose))
+        arguments = pose, batch.truth, self._category, failed
+        symmetric = pose_errors_up_to_symmetry(*arguments) if self._category.symmetries else None
+        return Estimates(
+            pose=_without(pose, failed),
+            failed=failed,
+            plausible=None if plausible is None else np.asarray(plausible) & ~failed,
+            errors=pose_errors(*arguments),
+            symmetric_errors=symmetric,
+        )
+
+
+def _without(pose: ArticulatedPose, failed: Any) -> ArticulatedPose:
+    """Poses [B, ...] with NaN where they failed [B]; numpy or JAX's arrays."""
+    xp = np if isinstance(failed, np.ndarray) else jnp
+    return jax.tree.map(
+        lambda a: xp.where(failed.reshape((-1,) + (1,) * (a.ndim - 1)), np.nan, a), pose
     )
 
 
 def model_predictor(estimator: Callable[[np.ndarray], Any]) -> Predictor:
-    """The estimates of a trained model (``caper_jax.estimator.load``)."""
+    """The estimates of a trained model as a predictor, one call per batch.
+
+    ``evaluate`` takes an ``Estimator`` as it is, which is faster; this is for what only calls it.
+    """
 
     def predict(frames: Sequence[Frame], points: np.ndarray) -> ArticulatedPose | Prediction:
         return estimator(points)
@@ -173,33 +320,3 @@ def mean_predictor(category: Category, mean_pose: Mapping[str, Any], source: str
         return place(points.mean(1))
 
     return predict
-
-
-def cloud_of(frame: Frame, num_points: int) -> Float32[np.ndarray, "points 3"]:
-    """[N, 3] points that a predictor sees; some cloud where the frame shows too little to use."""
-    if not shows_object(np.asarray(frame.points, np.float32)):
-        return np.linspace((-0.1, -0.1, 0.9), (0.1, 0.1, 1.1), num_points, dtype=np.float32)
-    return sample_points(frame.points, num_points, where=frame.name).points
-
-
-def _truth(frame: Frame, category: Category) -> ArticulatedPose:
-    if frame.truth is None:
-        raise CaperError(f"frame {frame.name!r} has no ground truth to evaluate against")
-    problems = pose_problems(frame.truth, category)
-    if problems:
-        raise CaperError(f"ground truth of frame {frame.name!r}: {'; '.join(problems)}")
-    return frame.truth
-
-
-def _checked(pose: ArticulatedPose, frame: Frame, category: Category) -> ArticulatedPose:
-    """The estimate, or NaN everywhere if it failed."""
-    finite = all(np.isfinite(array).all() for array in jax.tree.leaves(pose))
-    if finite and shows_object(np.asarray(frame.points, np.float32)):
-        return pose
-    shapes = pose_shapes(category.num_parts)
-    return ArticulatedPose(**{key: np.full(shape, np.nan) for key, shape in shapes.items()})
-
-
-def stack(trees: Sequence[Tree]) -> Tree:
-    """Poses or results of frames as one, with a leading axis of frames; numpy arrays."""
-    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)

@@ -20,8 +20,6 @@ from caper_jax.evaluation.metrics import (
     JOINT_METRICS,
     PART_METRICS,
     PoseErrors,
-    pose_errors,
-    pose_errors_up_to_symmetry,
 )
 from caper_jax.evaluation.protocol import Evaluation
 from caper_jax.files import write_atomically
@@ -60,8 +58,7 @@ def summarize(
       weights: names the model; None when none was used.
     """
     category = dataset.category
-    arguments = (evaluation.estimate, evaluation.truth, category, evaluation.failed)
-    errors = pose_errors(*arguments)
+    errors = evaluation.errors
     report: dict[str, Any] = {
         "category": category.name,
         "format": dataset.format,
@@ -84,10 +81,10 @@ def summarize(
         report["by_opening"] = errors_by_opening(errors, state, category)
     if not np.isnan(evaluation.visibility).all():
         report["by_occlusion"] = errors_by_occlusion(errors, evaluation.visibility, category)
-    if category.symmetries:
+    if evaluation.symmetric_errors is not None:
         report["up_to_symmetry"] = {
             "reasons": [symmetry.reason for symmetry in category.symmetries],
-            **error_tables(pose_errors_up_to_symmetry(*arguments), category),
+            **error_tables(evaluation.symmetric_errors, category),
         }
     return report
 
@@ -189,6 +186,7 @@ def summary(values: Float[np.ndarray, " frames"]) -> dict[str, float | None]:
     if np.isnan(values).all():
         return {"mean": None, "median": None}
     # Nine digits: the truth's IoU is 1, not one rounding of float64 below it.
+    values = np.asarray(values, np.float64)  # sums of float32 would depend on their order
     return {
         "mean": float(f"{np.mean(values):.9g}"),
         "median": float(f"{np.median(values):.9g}"),

@@ -16,8 +16,8 @@ from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.config import TrackerConfig
 from caper_jax.data.types import Frame
 from caper_jax.errors import CaperError
+from caper_jax.evaluation.loading import stack
 from caper_jax.evaluation.metrics import PoseErrors, pose_errors
-from caper_jax.evaluation.protocol import stack
 from caper_jax.evaluation.records import frame_record
 from caper_jax.evaluation.report import error_tables, format_tables, text_table
 from caper_jax.models import plausibility

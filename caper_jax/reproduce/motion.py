@@ -11,8 +11,8 @@ import numpy as np
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.errors import CaperError
+from caper_jax.evaluation.loading import stack
 from caper_jax.evaluation.metrics import pose_errors
-from caper_jax.evaluation.protocol import stack
 from caper_jax.lie import so3
 from caper_jax.reproduce.data import Videos, find_models, open_videos
 from caper_jax.reproduce.options import Options

@@ -5,16 +5,19 @@ import json
 import types
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from _helpers.frames import random_frames
 from scipy.spatial.transform import Rotation
 
 from caper_jax import categories, cli
+from caper_jax.config import GeneratorConfig, NetworkConfig
 from caper_jax.data.clouds import sample_points
 from caper_jax.data.hdf5 import Hdf5Dataset, write
 from caper_jax.errors import CaperError
-from caper_jax.evaluation import protocol, report
+from caper_jax.estimator import Estimator
+from caper_jax.evaluation import loading, protocol, report
 from caper_jax.evaluation.metrics import PoseErrors
 from caper_jax.evaluation.report import errors_by_opening
 from caper_jax.geometry.raster_order import raster_order
@@ -32,6 +35,19 @@ MEAN_POSE = {
 }
 
 
+class Known(Estimator):
+    """An estimator that is a function of points, without weights."""
+
+    def __init__(self, function):
+        self.category, self.network, self.variables = BOX, NetworkConfig(), {}
+        self.card, self.function = {}, function
+
+    def __call__(self, points):
+        found = self.function({}, points[None])
+        one = jax.tree.map(lambda leaf: leaf[0], vars(found))
+        return types.SimpleNamespace(**one)
+
+
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     path = tmp_path_factory.mktemp("data") / "box_test.h5"
@@ -43,16 +59,14 @@ def path(tmp_path_factory):
 def estimator(monkeypatch):
     """Stands for ``caper_jax.estimator``: its estimate is the identity, 1 m away, state 0."""
 
-    class Estimator:
-        category, card = BOX, {"mean_pose": MEAN_POSE}
+    def function(variables, points):
+        pose = protocol.mean_predictor(BOX, MEAN_POSE, "card")((), points)
+        return types.SimpleNamespace(pose=pose, plausible=jnp.ones(len(points), bool))
 
-        def __call__(self, points):
-            assert points.shape == (protocol.BATCH_SIZE, protocol.NUM_POINTS, 3)
-            pose = protocol.mean_predictor(BOX, MEAN_POSE, "card")((), points)
-            return types.SimpleNamespace(pose=pose)
-
-    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: Estimator())
-    return Estimator
+    model = Known(function)
+    model.card = {"mean_pose": MEAN_POSE}
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: model)
+    return model
 
 
 def run(path, out, *options):
@@ -251,26 +265,30 @@ def test_the_worst_frames_are_named_and_drawn(path, tmp_path, monkeypatch, capsy
     """Of an estimator that turns one frame by 90 deg, two by 60, and is right on the rest."""
     frames = Hdf5Dataset(path)
     turns = {frames[7].name: 90.0, frames[3].name: 60.0, frames[11].name: 60.0}
-    known = [(protocol.cloud_of(f, 1024), f) for f in (frames[i] for i in range(FRAMES))]
+    known = [(loading.cloud_of(f, 1024), f) for f in (frames[i] for i in range(FRAMES))]
 
-    class Estimator:
-        category, card = BOX, {}
+    clouds = jnp.stack([cloud for cloud, _ in known])
+    truths = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[frame.truth for _, frame in known])
+    angles = [[turns.get(frame.name, 0.0)] for _, frame in known]
+    turned = jnp.asarray(Rotation.from_euler("x", angles, degrees=True).as_matrix(), jnp.float32)
 
-        def __call__(self, points):
-            clouds = points if points.ndim == 3 else points[None]
-            poses = [self.pose(cloud) for cloud in clouds]
-            pose = jax.tree.map(lambda *a: np.stack(a), *poses) if points.ndim == 3 else poses[0]
-            labels = np.zeros(points.shape[:-1], np.int32)
-            return types.SimpleNamespace(
-                pose=pose, points=points, labels=labels, reason=0, size_ratio=1
-            )
+    def function(variables, points):
+        off = jnp.abs(points[:, None] - clouds).sum((-1, -2))
+        index = off.argmin(1)
+        pose = jax.tree.map(lambda leaf: leaf[index], truths)
+        rotation = turned[index][:, None] @ pose.rotation
+        labels = jnp.zeros(points.shape[:-1], jnp.int32)
+        yes = jnp.ones(len(points), bool)
+        return types.SimpleNamespace(
+            pose=pose.replace(rotation=rotation),
+            points=points,
+            labels=labels,
+            plausible=yes,
+            reason=0 * index,
+            size_ratio=1.0 * yes,
+        )
 
-        def pose(self, cloud):
-            frame = next(f for other, f in known if np.array_equal(cloud, other))
-            turn = Rotation.from_euler("x", turns.get(frame.name, 0.0), degrees=True).as_matrix()
-            return frame.truth.replace(rotation=turn @ frame.truth.rotation)
-
-    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: Estimator())
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: Known(function))
     assert run(path, tmp_path, "--worst", "2") == 0
     lines = capsys.readouterr().out.split("largest errors of rotation:")[1].splitlines()
     assert [line.split()[0] for line in lines[1:3]] == ["90.0", "60.0"]
@@ -278,6 +296,41 @@ def test_the_worst_frames_are_named_and_drawn(path, tmp_path, monkeypatch, capsy
     assert "worst.png" in lines[-1] and (tmp_path / "worst.png").read_bytes()[:4] == b"\x89PNG"
     assert run(path, tmp_path, "--worst", "2", "--predictor", "truth") == 2
     assert "leave out --predictor" in capsys.readouterr().err
+
+
+def test_frames_are_generated_as_it_goes(tmp_path, estimator, monkeypatch):
+    """The same figures as from a file of ``caper generate``, up to how a file keeps points."""
+    small = GeneratorConfig(instances=3, grid=24, num_points=300, measure_visibility=True)
+    monkeypatch.setattr("caper_jax.reproduce.data.FRAME_DATA", small)
+    out, file = tmp_path / "out", tmp_path / "box.h5"
+    given = ["evaluate", "--category", "box", "--out", str(out)]
+    assert cli.main([*given, "--generate", "9", "--seed", "4", "--noise", "gauss3mm"]) == 0
+    one = json.loads((out / "metrics.json").read_text())
+    assert (one["format"], one["split"], one["frames"]) == ("generated", "test", 9)
+    drawn = ["--frames", "9", "--seed", "4", "--noise", "gauss3mm", "--instances", "3"]
+    sizes = ["--points", "300", "--grid", "24"]
+    assert cli.main(["generate", "--category", "box", "--out", str(file), *drawn, *sizes]) == 0
+    assert cli.main([*given, "--data", str(file)]) == 0
+    other = json.loads((out / "metrics.json").read_text())
+    for a, b in zip(one["parts"], other["parts"], strict=True):
+        assert a["rotation_deg"] == pytest.approx(b["rotation_deg"], rel=1e-5)
+        assert a["translation_m"] == pytest.approx(b["translation_m"], rel=1e-3)
+    assert one["by_occlusion"][0]["parts"][1]["frames"] > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "give either --data or --generate"),
+        (["--generate", "5", "--data", "box.h5"], "give either --data or --generate"),
+        (["--generate", "5", "--split", "val"], "--split goes with --data"),
+        (["--data", "box.h5", "--seed", "3"], "--seed goes with --generate"),
+        (["--generate", "0"], "--generate must be at least 1, got 0"),
+    ],
+)
+def test_frames_come_from_one_place(tmp_path, capsys, options, message):
+    assert cli.main(["evaluate", "--category", "box", "--out", str(tmp_path / "o"), *options]) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "o").exists()
 
 
 @pytest.mark.parametrize("name", ["eyeglasses", "robotarm"])
@@ -343,7 +396,7 @@ def test_clouds_are_spread_over_all_points(path):
         seen.append(points)
         return protocol.truth_predictor(frames, points)
 
-    evaluation = protocol.evaluate(dataset, predictor, limit=2, batch_size=2, num_points=500)
+    evaluation = protocol.evaluate(dataset, predictor, frames=2, batch_size=2, num_points=500)
     points = dataset[1].points
     np.testing.assert_array_equal(seen[0][1], points[raster_order(points)][1::3])
     assert evaluation.names == ["000000", "000001"]
