@@ -30,6 +30,8 @@ Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 Fraction = Annotated[float, Ge(0), Le(1)]
 Seed = Annotated[int, Ge(0), Lt(2**32)]
+# The grid has a margin that holds no wider rim.
+MaskExtent = tuple[Annotated[float, Ge(0), Le(0.08)], Annotated[float, Ge(0), Le(0.08)]]
 
 SensorName = Literal["none", "gauss3mm", "kinect", "realsense"]
 OccluderName = Literal["edge", "strip", "blob"]
@@ -226,8 +228,8 @@ class GeneratorConfig:
       occlusion: rate of frames with a part of the object hidden by something in front.
       occluders: how it hides, one drawn per frame: "edge" all beyond a line, "strip" a band
         across the image, "blob" an ellipse.
-      erosion: rate of frames whose mask is too tight, by 1 to 3 % of the grid's side; frames that
-        take in the table are spared.
+      erosion: rate of frames whose mask is too tight; frames that take in the table are spared.
+      erosion_range: by how much, least and most, of the grid's side; at least by a pixel.
       table: rate of frames whose mask takes in the table along a stretch of the silhouette; the
         table is the plane through the object's lowest point.
       clutter: rate of frames whose mask takes in a blob of another surface, in front of the
@@ -245,9 +247,9 @@ class GeneratorConfig:
         tenth of the object's diagonal on average; each frame draws its own. These have label -1.
       flying: largest fraction of flying pixels among those where the depth jumps to something
         behind: they lie anywhere between the two; each frame draws its own. They have label -1.
-      rim: rate of frames whose mask is too wide all around, by 1.5 to 8 % of the grid's side, and
-        takes in the table or, in half of all frames, a wall; the rest of the rim has no depth.
-        These points have label -1.
+      rim: rate of frames whose mask is too wide all around and takes in the table or, in half of
+        all frames, a wall; the rest of the rim has no depth. These points have label -1.
+      rim_range: by how much, least and most, of the grid's side.
       hand: rate of frames with a hand that touches the object and hides what is behind it: in the
         mask, with label -1, or not, one as often as the other.
       cable: rate of frames with a cable: in front of the object, in the mask (label -1) or not, or
@@ -264,6 +266,7 @@ class GeneratorConfig:
     occlusion: Fraction = 0.0
     occluders: Annotated[tuple[OccluderName, ...], MinLen(1)] = ("edge",)
     erosion: Fraction = 0.0
+    erosion_range: MaskExtent = (0.0, 0.03)
     table: Fraction = 0.0
     clutter: Fraction = 0.0
     spill: Fraction = 0.1
@@ -275,10 +278,17 @@ class GeneratorConfig:
     speckle: Fraction = 0.0
     flying: Fraction = 0.0
     rim: Fraction = 0.0
+    rim_range: MaskExtent = (0.015, 0.08)
     hand: Fraction = 0.0
     cable: Fraction = 0.0
     few_points: Fraction = 0.0
     measure_visibility: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("erosion_range", "rim_range"):
+            least, most = getattr(self, name)
+            if least > most:
+                raise CaperError(f"data.{name} goes from {least} down to {most}; least comes first")
 
 
 @section

@@ -25,8 +25,6 @@ from caper_jax.synthetic.capsules import (
 from caper_jax.synthetic.instances import InstanceBank
 from caper_jax.synthetic.ray_casting import FAR
 
-WIDEST_RIM = 0.08  # of the grid's side
-_NARROWEST_RIM = 0.015
 _FARTHEST_WALL_M = 6.0
 _FEWEST_POINTS = 48
 
@@ -113,15 +111,24 @@ def background(
     return jnp.where(uniform[0] < 0.5, jnp.minimum(table, behind), table)
 
 
-def widen(key: PRNGKeyArray, scene: Scene, rate: ArrayLike) -> Scene:
-    """A mask too wide all around, by 1.5 to 8 % of the grid's side, in a fraction of the frames.
+def widen(
+    key: PRNGKeyArray, scene: Scene, rate: ArrayLike, extent: tuple[float, float] = (0.015, 0.08)
+) -> Scene:
+    """A mask too wide all around, in a fraction of the frames.
 
     It takes in what is seen there; pixels without any depth stay out.
+
+    Args:
+      key: PRNG key.
+      scene: of one frame.
+      rate: fraction of frames.
+      extent: by how much, least and most, of the grid's side.
     """
     side = scene.hit.shape[0]
     chance, width = jax.random.uniform(key, (2,))
-    most = max(1, round(WIDEST_RIM * side))
-    width = _NARROWEST_RIM + (WIDEST_RIM - _NARROWEST_RIM) * width
+    narrowest, widest = extent
+    most = max(1, round(widest * side))
+    width = narrowest + (widest - narrowest) * width
     radius = jnp.clip(jnp.round(width * side), 1, most)
     wide = scene.hit
     for step in range(most):

@@ -260,7 +260,8 @@ def _apply_mask(
         cable_key = jax.random.fold_in(key, 18)
         scene = disturbances.add_cable(cable_key, scene, diagonal, rays, config.cable)
     if is_on(config.rim):
-        scene = disturbances.widen(jax.random.fold_in(key, 19), scene, config.rim)
+        rim_key = jax.random.fold_in(key, 19)
+        scene = disturbances.widen(rim_key, scene, config.rim, config.rim_range)
     depth, part, hit, _ = scene
     if is_on(config.table) or is_on(config.clutter):
         table = masks.table_depth(instance, poses, category.viewpoint, rays)
@@ -269,7 +270,8 @@ def _apply_mask(
             jax.random.fold_in(key, 3), depth, part, hit, table, config.table, config.spill
         )
     if is_on(config.erosion):
-        eroded = masks.erode(jax.random.fold_in(key, 2), hit, config.erosion)
+        erosion_key = jax.random.fold_in(key, 2)
+        eroded = masks.erode(erosion_key, hit, config.erosion, config.erosion_range)
         # A mask that takes in the table is not too tight.
         hit = jnp.where((hit & (part < 0)).any(), hit, eroded)
     if is_on(config.clutter):

@@ -20,7 +20,6 @@ from caper_jax.synthetic.instances import InstanceBank
 from caper_jax.synthetic.ray_casting import FAR
 
 OCCLUDERS = ("edge", "strip", "blob")
-_EROSION = 0.03  # largest erosion and
 _RIM = 0.04  # widest rim, of the grid's side
 _HOLES = 4  # most missing blobs per frame
 _FARTHEST_TABLE_M = 6.0
@@ -77,17 +76,23 @@ def occlude(
     return keep_most(hit & (kept | (uniform[2] >= rate)), hit)
 
 
-def erode(key: PRNGKeyArray, hit: Bool[Array, "G G"], rate: ArrayLike) -> Bool[Array, "G G"]:
-    """The hits left by a mask that is too tight, by 1 to 3 % of the grid's side.
+def erode(
+    key: PRNGKeyArray,
+    hit: Bool[Array, "G G"],
+    rate: ArrayLike,
+    extent: tuple[float, float] = (0.0, 0.03),
+) -> Bool[Array, "G G"]:
+    """The hits left by a mask that is too tight.
 
     Args:
       key: PRNG key.
       hit: [G, G] bool.
       rate: fraction of frames.
+      extent: by how much, least and most, of the grid's side; at least by a pixel.
     """
     uniform = jax.random.uniform(key, (2,))
-    most = max(1, round(_EROSION * hit.shape[0]))
-    radius = jnp.floor(uniform[0] * most) + 1.0
+    least, most = (max(1, round(share * hit.shape[0])) for share in extent)
+    radius = jnp.floor(uniform[0] * (most - least + 1)) + least
     eroded = ~_grown(~hit, radius, most, beyond=True)
     return jnp.where(uniform[1] < rate, keep_most(eroded, hit), hit)
 

@@ -158,6 +158,13 @@ def test_rims_run_all_around_within_their_widths():
         assert missing > 0.95 * outward[image].max()
 
 
+def test_rims_of_a_given_width():
+    wide = over_keys(lambda key: dist.widen(key, SCENE, 1.0, (0.047, 0.047)), 20)
+    outward = ndimage.distance_transform_edt(~DISC)
+    for image in wide.hit & ~DISC:  # 3 of 64 pixels, an octagon
+        assert 2.5 < outward[image].max() < 3 * 1.09 + 0.5
+
+
 def test_rims_leave_out_what_has_no_depth_and_other_parts_of_the_object():
     part = jnp.where(COLUMNS > 33, PART, -1)  # the left half is not of the object
     scene = dist.Scene(DEPTH, PART, HIT & (COLUMNS > 33), jnp.where(ROWS < 30, FAR, TABLE))

@@ -72,6 +72,15 @@ def test_erosion_keeps_its_rate_and_width():
         assert inward[image].min() > 1.0
 
 
+def test_erosion_by_a_given_width():
+    left = over_keys(lambda key: masks.erode(key, HIT, 1.0, (0.05, 0.05)))
+    inward = distance_to(~DISC)
+    for image in left:
+        # 5 % of 64 pixels, in steps to the sides: a diagonal is as far as two of them.
+        assert 2.5 < inward[DISC & ~image].max() <= 3.0
+        assert inward[image].min() > 4 / np.sqrt(2) - 0.1
+
+
 def test_thin_objects_are_not_eroded_away():
     thin = np.abs(ROWS - 30) < 1
     left = over_keys(lambda key: masks.erode(key, jnp.asarray(thin), 1.0))
