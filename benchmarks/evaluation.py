@@ -30,6 +30,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="per frame of the file (default: %(default)s)",
     )
     parser.add_argument(
+        "--grid",
+        type=positive_int,
+        default=96,
+        help="rays per side of the file's frames (default: %(default)s)",
+    )
+    parser.add_argument(
         "--repeats", type=positive_int, default=5, help="runs (default: %(default)s)"
     )
 
@@ -41,8 +47,8 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     samples and measures. Each compiles before.
     """
     import jax
+    import numpy as np
 
-    from benchmarks.models import clouds
     from caper_jax import categories
     from caper_jax.config import GeneratorConfig
     from caper_jax.data import hdf5
@@ -53,8 +59,9 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     category = categories.get(arguments.category)
     estimator = load(category)
     batches = -(-arguments.frames // arguments.batch)
-    config = GeneratorConfig(instances=100, num_points=arguments.points)
-    resident = jax.device_put(clouds(category, arguments.batch, estimator.network.num_points))
+    config = GeneratorConfig(
+        instances=min(arguments.frames, 100), grid=arguments.grid, num_points=arguments.points
+    )
     estimate = jax.jit(estimator.function)
 
     with tempfile.TemporaryDirectory() as folder:
@@ -62,6 +69,8 @@ def run(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
         drawn = collect_frames(Generator(category, config, "test"), 0, arguments.frames)
         hdf5.write(path, category=category, split="test", **drawn)
         dataset = hdf5.Hdf5Dataset(path)
+        some = np.resize(drawn["points"], (arguments.batch, *drawn["points"].shape[1:]))
+        resident = jax.device_put(estimator.sampled(some))
 
         def estimated() -> None:
             for _ in range(batches):

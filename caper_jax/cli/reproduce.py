@@ -28,6 +28,7 @@ EXAMPLES = (
     ("table9 --category box --seeds 3 --steps 2000", "trains six models"),
     ("table7 --category laptop --preset fast", "trains 16 models of full size"),
     ("robustness --category box", "what stray points do"),
+    ("sweep --sweep occlusion,points --category box", "error against one condition at a time"),
     ("jitter --category box --videos 4", "a quick look"),
 )
 SECTIONS = {name: text for name, text in TRAINING_SECTIONS.items() if name != "loader"}
@@ -94,6 +95,11 @@ REPRODUCTIONS = {
     "robustness": Reproduction("robustness", "stray points, loose masks and few points", _ROBUST),
     "plausibility": Reproduction(
         "robustness", "which wrong units and wrong objects a model recognizes", _ROBUST
+    ),
+    "sweep": Reproduction(
+        "sweep",
+        "error against occlusion, noise, distance, points, mask, roll",
+        (*_ROBUST, "sweep"),
     ),
     "jitter": Reproduction("motion", "jitter on an object that stands still", _MOVING),
     "modes": Reproduction("motion", "errors by how camera and joints move", _MOVING),

@@ -43,6 +43,7 @@ class Options:
         3.7 for the laptops of PM-Videos and ArtImage (PartNet units read as meters)
       seed: of generated frames and videos
       noise: of generated depth (default: kinect)
+      sweep: occlusion, noise, distance, points, mask or roll, several with commas (default: all)
       given_masks: add rows with the data's part labels
       network_alone: track without registration, as the paper does
       seeds: models to train of each variant, with the seeds 0, 1, ... (default: the study's)
@@ -64,6 +65,7 @@ class Options:
     object_scale: Positive = 1.0
     seed: Annotated[int, Ge(0)] = 0
     noise: Literal["none", "gauss3mm", "kinect", "realsense"] | None = None
+    sweep: tuple[str, ...] = ()
     given_masks: bool = False
     network_alone: bool = False
     seeds: Count | None = None

@@ -58,22 +58,37 @@ def run(name: str, options: Options) -> Report:
     return _robustness(options) if name == "robustness" else _plausibility(options)
 
 
-def unseen_frames(estimator: Estimator, options: Options, **changes: Any) -> Batch:
+def unseen_frames(
+    estimator: Estimator,
+    options: Options,
+    distance: tuple[float, float] | None = None,
+    frames: int | None = None,
+    **changes: Any,
+) -> Batch:
     """Generated frames of unseen instances, with the noise of one sensor and ``changes``.
+
+    Args:
+      estimator: gives category and number of points.
+      options: seed, noise and number of frames.
+      distance: of the cameras, in object diagonals; as the category has it by default.
+      frames: how many, where not as the options say.
+      changes: of the ``GeneratorConfig``.
 
     Raises:
       CaperError: a category without shapes.
     """
     category = estimator.category
+    if distance is not None:
+        view = replace(category.viewpoint, distance=distance)
+        category = replace(category, viewpoint=view)
     if category.shape is None:
         raise CaperError(f"{category.name}: it draws no shapes, so there is nothing to generate")
     config = GeneratorConfig(instances=_INSTANCES, num_points=estimator.network.num_points)
-    generator = Generator(
-        category, options.generator(replace(config, **changes)), SPLIT, options.seed
-    )
+    config = replace(options.generator(config), **changes)
+    generator = Generator(category, config, SPLIT, options.seed)
     key = split_key(SPLIT, options.seed)
     title = f"generating {category.name}"
-    return collect(generator.batch, key, options.frames or FRAMES, BATCH, title)
+    return collect(generator.batch, key, frames or options.frames or FRAMES, BATCH, title)
 
 
 def disturbances() -> Iterator[tuple[str, float, Callable[..., np.ndarray]]]:

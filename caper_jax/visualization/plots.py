@@ -9,22 +9,40 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
 
-_SIZE, _DPI = (8.0, 4.5), 120
+_SIZE, _PANELS_SIZE, _DPI = (8.0, 4.5), (9.5, 7.0), 120
 
 
 @dataclass(frozen=True)
 class Curves:
-    """Lines of one plot: label -> (x [N], y [N])."""
+    """Lines of one plot: label -> (x [N], y [N]).
+
+    Attributes:
+      log_x: logarithmic axis, whose ticks are then the points themselves.
+      log_y: likewise; otherwise the axis begins at 0.
+      marked: mark the points of the lines, where there are few.
+    """
 
     title: str
     x_label: str
     y_label: str
     lines: dict[str, tuple[np.ndarray, np.ndarray]]
+    log_x: bool = False
+    log_y: bool = False
+    marked: bool = False
+
+
+@dataclass(frozen=True)
+class Panels:
+    """Several plots of lines in rows of two under one title."""
+
+    title: str
+    panels: Sequence[Curves]
 
 
 @dataclass(frozen=True)
@@ -46,7 +64,7 @@ class Intervals:
     panels: dict[str, dict[str, tuple[float, float, float]]]
 
 
-Plot = Curves | Scatter | Intervals
+Plot = Curves | Panels | Scatter | Intervals
 
 
 def write_plot(path: str | Path, plot: Plot) -> Path:
@@ -61,9 +79,15 @@ def write_plot(path: str | Path, plot: Plot) -> Path:
     Raises:
       CaperError: the file cannot be written.
     """
-    figure = Figure(figsize=_SIZE, dpi=_DPI, facecolor="white", layout="constrained")
+    size = _PANELS_SIZE if isinstance(plot, Panels) else _SIZE
+    figure = Figure(figsize=size, dpi=_DPI, facecolor="white", layout="constrained")
     if isinstance(plot, Curves):
-        _draw_curves(figure, plot)
+        _draw_curves(figure.add_subplot(), plot)
+    elif isinstance(plot, Panels):
+        rows = -(-len(plot.panels) // 2)
+        for place, curves in enumerate(plot.panels, start=1):
+            _draw_curves(figure.add_subplot(rows, 2, place), curves)
+        figure.suptitle(plot.title)
     elif isinstance(plot, Scatter):
         _draw_scatter(figure, plot)
     else:
@@ -71,12 +95,20 @@ def write_plot(path: str | Path, plot: Plot) -> Path:
     return save_figure(figure, path)
 
 
-def _draw_curves(figure: Figure, curves: Curves) -> None:
-    axes = figure.add_subplot()
+def _draw_curves(axes: Axes, curves: Curves) -> None:
     for label, (x, y) in curves.lines.items():
-        axes.plot(x, y, label=label, linewidth=1.2)
+        axes.plot(x, y, label=label, linewidth=1.2, marker="o" if curves.marked else "", ms=4)
     axes.set(title=curves.title, xlabel=curves.x_label, ylabel=curves.y_label)
-    axes.set_ylim(bottom=0.0)
+    if curves.log_x:
+        axes.set_xscale("log")
+        ticks = np.unique(np.concatenate([x for x, _ in curves.lines.values()]))
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.minorticks_off()
+    if curves.log_y:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    else:
+        axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
 

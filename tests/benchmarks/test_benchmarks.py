@@ -17,6 +17,7 @@ from caper_jax import categories, machine
 from caper_jax import estimator as estimators
 from caper_jax.config import PRESETS, preset
 from caper_jax.errors import CaperError
+from caper_jax.evaluation import protocol
 
 BASELINE = {"estimator": 2.0, "log": 0.4}
 
@@ -98,6 +99,23 @@ def test_many_videos_at_once(few, monkeypatch):
     assert len(shown) == 3 and shown[0].shape == (5, 64, 3)
     np.testing.assert_array_equal(shown[1][4], shown[1][0])
     assert (shown[1][1] != shown[1][0]).any()
+
+
+def test_an_evaluation_beside_its_estimates(capsys, tmp_path, monkeypatch):
+    """Both have all frames of the file, and the evaluation all errors."""
+    box = categories.get("box")
+    weights = tiny.random_variables(box, tiny.network())
+    model = estimators.Estimator(box, tiny.network(), weights)
+    monkeypatch.setattr(estimators, "load", lambda *_: model)
+    measured, evaluations = protocol.evaluate, []
+    monkeypatch.setattr(protocol, "evaluate", lambda *a, **k: evaluations.append(measured(*a, **k)))
+    sizes = ("--frames", "9", "--batch", "8", "--points", "100", "--grid", "16")
+    sizes = (*sizes, "--repeats", "1")
+    (row,) = run(capsys, tmp_path, "evaluation", "--category", "box", *sizes)
+    assert (row["frames"], row["batch"]) == (9, 8)
+    ratio = 100 * row["evaluated_per_s"] / row["estimates_per_s"]
+    assert row["ratio_%"] == pytest.approx(ratio, rel=0.05)
+    assert [len(found.errors.rotation_deg) for found in evaluations] == [9, 9]
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
