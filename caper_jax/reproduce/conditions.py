@@ -74,7 +74,7 @@ def hide(
 def with_noise(
     points: Float[np.ndarray, "B N 3"], deviation: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "B N 3"]:
-    """Clouds with normal noise of the depth, meters; points move along their rays."""
+    """Clouds with normal noise of the depth, of this deviation in meters, along their rays."""
     depth = points[..., 2:]
     factor = 1.0 + deviation * rng.normal(size=depth.shape) / depth
     return (points * factor).astype(np.float32)
@@ -168,10 +168,10 @@ SWEEPS = {
     ),
     "mask": Sweep(
         "mask error",
-        "mask too wide by [% of the grid's side]",
+        "mask too wide by [% of the object's width]",
         _mask,
-        "below 0 the mask is too tight all around, above 0 it takes in table and wall; the grid "
-        "spans the object in the image",
+        "below 0 the mask is too tight all around, above 0 it takes in table and wall; in percent "
+        "of the object's width in the image",
     ),
     "roll": Sweep(
         "camera roll",

@@ -53,7 +53,7 @@ def run(name: str, options: Options) -> Report:
         for key in chosen:
             sweep = SWEEPS[key]
             levels = [
-                {"at": round(at, 6), **measured(estimator, points, truth)}
+                {"at": round(at, 2), **measured(estimator, points, truth)}
                 for at, points, truth in sweep.levels(draw, options)
             ]
             result[category][key] = levels
@@ -155,7 +155,7 @@ def _row(category: str, key: str, level: dict[str, Any], definition: Category) -
         for unit, spread in level["state"].items()
     ]
     return [
-        *(category, key, f"{level['at']:.3g}"),
+        *(category, key, f"{level['at']:g}"),
         *(number(rotation[one], 2) for one in ("median", "p90")),
         number(level["flipped"], 1, 100.0),
         *(number(translation[one], 1, 1000.0) for one in ("median", "p90")),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
 from caper_jax.errors import CaperError
 from caper_jax.files import write_atomically
@@ -106,7 +107,9 @@ def _draw_curves(axes: Axes, curves: Curves) -> None:
         axes.minorticks_off()
     if curves.log_y:
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        # Plain numbers; between powers of ten where there are few of these.
+        axes.yaxis.set_major_formatter(LogFormatter())
+        axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
     else:
         axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.3)
