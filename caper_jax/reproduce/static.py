@@ -14,7 +14,7 @@ from caper_jax.data.types import Dataset
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator
 from caper_jax.evaluation.metrics import PoseErrors, object_diagonal, pose_errors
-from caper_jax.evaluation.protocol import evaluate, model_predictor
+from caper_jax.evaluation.protocol import evaluate
 from caper_jax.evaluation.report import (
     FLIPPED_DEG,
     format_error,
@@ -129,8 +129,7 @@ def measure(category: str, options: Options) -> dict[str, Any]:
     if source is None:
         return {"missing": NO_DATA}
     dataset, description = source
-    num_points = estimator.network.num_points
-    estimates = evaluate(dataset, model_predictor(estimator), options.frames, num_points=num_points)
+    estimates = evaluate(dataset, estimator, options.frames)
     weights = None if options.weights is None else str(options.weights)
     return {
         "data": description,

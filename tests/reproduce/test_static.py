@@ -28,11 +28,16 @@ def frames(tmp_path_factory):
     return ["--category", "box", "--data", str(path), "--format", "caper"]
 
 
+def by(predictor):
+    """Stands for ``evaluate``: whatever the model, this predictor answers."""
+    return lambda dataset, model, frames: protocol.evaluate(dataset, predictor, frames)
+
+
 @pytest.fixture
 def known(frames, monkeypatch):
     model = types.SimpleNamespace(category=BOX, network=network())
     monkeypatch.setattr(static, "find_model", lambda *_: model)
-    monkeypatch.setattr(static, "model_predictor", lambda _: protocol.truth_predictor)
+    monkeypatch.setattr(static, "evaluate", by(protocol.truth_predictor))
     return frames
 
 
@@ -56,7 +61,7 @@ def test_a_failure_counts_with_the_distance_over_the_diagonal(known, tmp_path, c
         pose = protocol.truth_predictor(frames, points)
         return pose.replace(rotation=np.full_like(pose.rotation, np.nan))
 
-    monkeypatch.setattr(static, "model_predictor", lambda _: fails)
+    monkeypatch.setattr(static, "evaluate", by(fails))
     assert run("table2", tmp_path, *known) == 0
     output = capsys.readouterr().out
     assert "5 failures" in output
