@@ -19,6 +19,7 @@ from _helpers.quick import traced_jit
 from _helpers.tiny import network, random_variables
 
 import caper_jax
+import caper_jax.evaluation.protocol  # its programs are jitted before a test replaces jax.jit
 from benchmarks.__main__ import main as benchmark
 from caper_jax import cli
 from caper_jax.config import (

@@ -78,7 +78,8 @@ def evaluate_models(
     """Errors of M models of one network on S sets of generated frames, all under one vmap.
 
     Frames are drawn on the device, 25 of each seed at a time; those of a seed are the frames that
-    ``caper generate`` writes for it, and every model sees the same ones.
+    ``caper generate`` writes for it, and every model sees the same ones. Calls with the same
+    generator and network, and as many models and seeds, compile once.
 
     Args:
       generator: draws the frames, of its split and of its instances.
@@ -98,14 +99,12 @@ def evaluate_models(
     """
     _check(generator, category, network, variables, frames, seeds)
     keys = jnp.stack([split_key(generator.split, seed) for seed in seeds])
-    run = jax.jit(
-        partial(
-            _errors_of_draw,
-            generator=generator,
-            category=category,
-            network=network,
-            up_to_symmetry=up_to_symmetry,
-        )
+    run = partial(
+        _errors_of_draw,
+        generator=generator,
+        category=category,
+        network=network,
+        up_to_symmetry=up_to_symmetry,
     )
     parts = []
     with progress("evaluating", total=frames) as bar:
@@ -117,6 +116,8 @@ def evaluate_models(
     return jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=2), *parts)
 
 
+# Static generators count by identity: another call with the same one compiles nothing.
+@partial(jax.jit, static_argnames=("generator", "category", "network", "up_to_symmetry"))
 def _errors_of_draw(
     variables: dict[str, Any],
     keys: Any,

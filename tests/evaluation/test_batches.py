@@ -36,6 +36,9 @@ def test_models_and_seeds_at_once_are_one_by_one_on_the_frames_of_generate(gener
     frames, seeds = 26, (0, 7)
     found = batches.evaluate_models(generator, BOX, NETWORK, STACKED, frames, seeds, True)
     assert found.rotation_deg.shape == (2, 2, frames, 2) and found.state.shape == (2, 2, frames, 1)
+    compiled = batches._errors_of_draw._cache_size()
+    batches.evaluate_models(generator, BOX, NETWORK, STACKED, 1, seeds, True)
+    assert batches._errors_of_draw._cache_size() == compiled
     predict = jax.jit(lambda v, points: estimate(v, points, BOX, NETWORK).pose)
     for s, seed in enumerate(seeds):
         drawn = collect_frames(generator, seed, frames)
