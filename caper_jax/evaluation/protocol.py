@@ -34,7 +34,7 @@ from caper_jax.lie import se3
 from caper_jax.progress import progress
 from caper_jax.synthetic.dataset import GeneratedDataset
 from caper_jax.synthetic.frames import Generator
-from caper_jax.training.parallel import DATA_AXIS, data_mesh
+from caper_jax.training.parallel import DATA_AXIS, batch_sharding, data_mesh, replicated
 
 BATCH_SIZE = 32
 NUM_POINTS = 1024
@@ -188,12 +188,14 @@ class _EstimatorStep:
     """Estimates and errors as one program, each device on its own rows."""
 
     def __init__(self, estimator: Estimator, category: Category, mesh: Mesh) -> None:
-        self._variables = estimator.variables
+        self._variables = jax.device_put(estimator.variables, replicated(mesh))
+        self._rows = batch_sharding(mesh)
         self._static = {"function": estimator.function, "category": category, "mesh": mesh}
 
     def predict(self, batch: FrameBatch) -> Estimates:
         truth = jax.tree.map(np.float32, batch.truth)
-        return _estimated(self._variables, batch.points, truth, batch.shown, **self._static)
+        arrays = jax.device_put((batch.points, truth, batch.shown), self._rows)
+        return _estimated(self._variables, *arrays, **self._static)
 
     def finish(self, batch: FrameBatch, found: Estimates) -> Estimates:
         return jax.device_get(found)

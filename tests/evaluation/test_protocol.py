@@ -17,9 +17,11 @@ from caper_jax.config import GeneratorConfig
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator
 from caper_jax.evaluation import batches, protocol
+from caper_jax.evaluation.loading import frame_batches
 from caper_jax.evaluation.metrics import PoseErrors, pose_errors
 from caper_jax.synthetic.dataset import GeneratedDataset
 from caper_jax.synthetic.frames import Generator, collect_frames
+from caper_jax.training.parallel import data_mesh
 
 BOX = categories.get("box")
 NETWORK = tiny.network()
@@ -104,6 +106,15 @@ def test_no_figure_depends_on_batches_or_devices(generator, batch_size, devices)
             np.testing.assert_allclose(
                 getattr(getattr(other, errors), key), values, rtol=1e-6, atol=1e-6
             )
+
+
+def test_programs_run_on_the_devices_given(generator):
+    dataset = GeneratedDataset(generator, 4)
+    model = Mean(dataset[0].truth)
+    (batch,) = frame_batches(dataset, 4, 4, 64)
+    for devices in (jax.devices()[2:3], jax.devices()[4:6]):
+        step = protocol._EstimatorStep(model, BOX, data_mesh(devices))
+        assert step.predict(batch).failed.devices() == set(devices)
 
 
 def test_frames_without_an_estimate_fail(generator):
