@@ -172,7 +172,18 @@ def back_project(
 def is_measured(points: np.ndarray) -> Bool[np.ndarray, "*batch"]:
     """Which points [..., 3] are any: NaN, infinity, zero and huge numbers stand for none."""
     # Comparisons with NaN are false.
-    return (np.abs(points) < _ABSURD).all(-1) & (points != 0).any(-1)
+    some = points != 0
+    return _all_within(points, _ABSURD, strictly=True) & (
+        some[..., 0] | some[..., 1] | some[..., 2]
+    )
+
+
+def _all_within(points: np.ndarray, reach: float, strictly: bool = False) -> np.ndarray:
+    """Which points [..., 3] have no coordinate beyond ``reach``, nor NaN."""
+    size = np.abs(points)
+    inside = size < reach if strictly else size <= reach
+    # Reductions over an axis of three take several times as long.
+    return inside[..., 0] & inside[..., 1] & inside[..., 2]
 
 
 def as_cloud(points: Any, where: str = "points") -> Float32[np.ndarray, "N 3"]:
@@ -233,7 +244,7 @@ def sample_points(
             f"{where}: median depth {median_depth:.4g} m lies behind the camera; the camera looks "
             "along +z (OpenCV): from an OpenGL frame negate y and z"
         )
-    kept = kept[(np.abs(cast[kept]) <= FARTHEST_M).all(-1)]
+    kept = kept[_all_within(cast, FARTHEST_M)[kept]]
     _check_count(len(kept), f"of {len(points)} points in {where}")
     if radius is not None:
         kept = kept[_near(cast[kept], radius)]
