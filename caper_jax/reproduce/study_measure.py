@@ -19,8 +19,8 @@ from caper_jax.data.clouds import MIN_POINTS, sample_points
 from caper_jax.data.types import Dataset, Frame
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, estimate, load
+from caper_jax.evaluation.loading import cloud_of, stack
 from caper_jax.evaluation.metrics import pose_errors
-from caper_jax.evaluation.protocol import cloud_of, stack
 from caper_jax.evaluation.report import error_tables
 from caper_jax.progress import progress
 from caper_jax.reproduce import tracking

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from caper_jax import categories, cli
 from caper_jax.data import hdf5
 from caper_jax.errors import CaperError
-from caper_jax.evaluation.protocol import stack
+from caper_jax.evaluation.loading import stack
 from caper_jax.reproduce import study_measure, study_run
 from caper_jax.training.train_many import MemberResult
 
