@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -36,11 +36,16 @@ class MembersStep:
     Args:
       group: what to train.
       mesh: shares the members among its devices; their number divides M.
+      chunk: members under one vmap on a device, the others follow; None for all of them, or what
+        suits the device.
     """
 
-    def __init__(self, group: Group, mesh: jax.sharding.Mesh | None = None) -> None:
+    def __init__(
+        self, group: Group, mesh: jax.sharding.Mesh | None = None, chunk: int | None = None
+    ) -> None:
         self.group = group
         self._mesh = mesh
+        self._chunk = chunk
         self._jitted = self._jit()
         self._statistics = self._jit_statistics()
         self._compiled: dict[int, Any] = {}
@@ -99,8 +104,11 @@ class MembersStep:
             step = state.step[0]  # that of all members
             batch = draw_batches(group, streams, step, stream_of)
             axis = None if sharing == "all" else 0
-            over_members = jax.vmap(member, in_axes=(0, 0, axis, None, None))
-            return over_members(state, numbers, batch, progress, factor)
+
+            def own(state: TrainState, numbers: Metrics, batch: PyTree):
+                return member(state, numbers, batch, progress, factor)
+
+            return over_members(own, (state, numbers), batch, axis, self._chunk)
 
         def run(state: TrainState, progress: Array, factor: Array, data: PyTree):
             if progress.shape[0] == 1:  # no loop: as in ``step.compile_step``
@@ -130,8 +138,12 @@ class MembersStep:
         def run(model_state: PyTree, weights: PyTree, seed: Array, step: Array, data: PyTree):
             streams, numbers, stream_of = data
             batch = draw_batches(group, streams, step, stream_of)
-            over_members = jax.vmap(member, in_axes=(0, 0, 0, 0, None, axis))
-            return over_members(model_state, weights, seed, numbers, step, batch)
+
+            def own(state: tuple[PyTree, PyTree, Array], numbers: Metrics, batch: PyTree):
+                return member(*state, numbers, step, batch)
+
+            states = (model_state, weights, seed)
+            return over_members(own, (states, numbers), batch, axis, self._chunk)
 
         return jax.jit(self._shared(run, (_SPLIT, _SPLIT, _SPLIT, _EVERYWHERE), _SPLIT))
 
@@ -148,6 +160,32 @@ class MembersStep:
             out_specs=out_specs,
             check_vma=False,
         )
+
+
+def over_members(
+    function: Callable[..., PyTree],
+    members: tuple[PyTree, ...],
+    batch: PyTree,
+    axis: int | None,
+    chunk: int | None,
+) -> PyTree:
+    """``function(*member, batch)`` for all members: under vmap, or so many at a time.
+
+    Args:
+      function: of one member.
+      members: arguments with a leading axis of members.
+      batch: one for all (``axis`` None), or one for each (0).
+      axis: see ``batch``.
+      chunk: members at a time; None for all.
+    """
+    count = len(jax.tree.leaves(members)[0])
+    if chunk is None or chunk >= count:
+        axes = (*(0 for _ in members), axis)
+        return jax.vmap(function, in_axes=axes)(*members, batch)
+    size = None if chunk == 1 else chunk
+    if axis is None:
+        return jax.lax.map(lambda own: function(*own, batch), members, batch_size=size)
+    return jax.lax.map(lambda own: function(*own), (*members, batch), batch_size=size)
 
 
 def draw_batches(
