@@ -176,11 +176,21 @@ def split_into_programs(members: Sequence[Member]) -> list[list[Member]]:
     return list(programs.values())
 
 
-def separating(members: Sequence[Member]) -> list[str]:
-    """Settings that keep members from sharing a program, e.g. ["network.joints"]."""
+def check_one_program(members: Sequence[Member]) -> None:
+    """Raises a CaperError for members that no single program can train; names the settings."""
     programs = [member.program for member in members]
     keys = sorted(set().union(*programs))
-    return [key for key in keys if any(p.get(key) != programs[0].get(key) for p in programs)]
+    keys = [key for key in keys if any(p.get(key) != programs[0].get(key) for p in programs)]
+    if not keys:
+        return
+    names: dict[str, str] = {}
+    for member in members:
+        names.setdefault(str(member.settings.get(keys[0])), member.name)
+    shown = ", ".join(f"{value} in {name}" for value, name in names.items())
+    raise CaperError(
+        f"{', '.join(keys)} cannot differ within one compiled program ({keys[0]}: {shown}); "
+        "train these members in separate programs"
+    )
 
 
 def make_group(members: Sequence[Member], category: Category, banks: Banks) -> Group:
@@ -194,15 +204,7 @@ def make_group(members: Sequence[Member], category: Category, banks: Banks) -> G
     Raises:
       CaperError: they do not; names the settings that change shapes.
     """
-    if keys := separating(members):
-        names: dict[str, str] = {}
-        for member in members:
-            names.setdefault(str(member.settings.get(keys[0])), member.name)
-        shown = ", ".join(f"{value} in {name}" for value, name in names.items())
-        raise CaperError(
-            f"{', '.join(keys)} cannot differ within one compiled program ({keys[0]}: {shown}); "
-            "train these members in separate programs"
-        )
+    check_one_program(members)
     settings = [member.settings for member in members]
 
     def varying(keys: Sequence[str], rows: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:

@@ -131,6 +131,8 @@ def train_many(
         Member(name, replace(config, category=known[name].name)) for name, config in configs.items()
     ]
     grid.check_members(members)
+    if one_program:
+        grid.check_one_program(members)
     directory = Path(directory)
     card = None if initial is None else read_card(initial)
     for member in members:
@@ -141,8 +143,6 @@ def train_many(
     for kind in {known[m.name].name: known[m.name] for m in waiting}.values():
         own = [m for m in waiting if m.config.category == kind.name]
         banks = draw_banks(own, kind)
-        if one_program:
-            grid.make_group(own, kind, banks)  # says what differs
         programs = grid.split_into_programs(own)
         for number, program in enumerate(programs, start=1):
             title = f"training {len(program)} x {kind.name}"

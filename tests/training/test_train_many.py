@@ -193,10 +193,12 @@ def test_shapes_ask_for_programs_of_their_own():
         grid.make_group(members[:2], BOX, train_many.draw_banks(members[:2], BOX))
 
 
-def test_one_program_refuses_what_changes_shapes(tmp_path):
-    runs = {"a": BASE, "b": override(BASE, "network.increment=euclidean")}
-    with pytest.raises(CaperError, match=r"network\.increment"):
+@pytest.mark.parametrize("change", ["network.increment=euclidean", "category=laptop"])
+def test_one_program_refuses_what_changes_shapes(change, tmp_path):
+    runs = {"a": BASE, "b": override(BASE, change)}
+    with pytest.raises(CaperError, match=change.partition("=")[0]):
         train_many.train_many(runs, tmp_path, one_program=True)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
