@@ -218,3 +218,32 @@ def test_corners():
 def test_wrong_shape_is_an_error():
     with pytest.raises(CaperError, match=r"size_b must have shape \[\.\.\., 3\]"):
         boxes.iou_size(np.ones(3), np.ones(2))
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-12), (np.float32, 1e-6)])
+def test_signed_distance_against_the_nearest_point_of_the_surface(dtype, tolerance):
+    g = np.random.default_rng(7)
+    center, size = g.normal(size=(300, 3)), g.uniform(0.1, 2, (300, 3))
+    points = center + 0.5 * g.normal(size=(300, 3))
+    with jax.enable_x64(dtype == np.float64):
+        arguments = [np.asarray(a, dtype) for a in (points, center, size)]
+        distance = np.asarray(boxes.signed_distance(*arguments))
+    low, high = center - size / 2, center + size / 2
+    nearest = np.clip(points, low, high)
+    outside = np.linalg.norm(points - nearest, axis=-1)
+    to_faces = np.minimum(points - low, high - points).min(-1)  # of points inside
+    assert 30 < (outside == 0).sum() < 270
+    expected = np.where(outside > 0, outside, -to_faces)
+    assert np.abs(distance - expected).max() < tolerance * 10
+
+
+def test_signed_distance_has_finite_derivatives_of_length_one():
+    places = [[0, 0, 0], [0.3, 0, 0], [0.5, 0, 0], [0.5, 1, 1.5], [2, 0, 0], [2, 3, 0]]
+    points = jnp.array(places, float)
+    gradient = jax.vmap(jax.grad(boxes.signed_distance), (0, None, None))(
+        points, jnp.zeros(3), jnp.array([1.0, 2.0, 3.0])
+    )
+    assert jnp.isfinite(gradient).all()
+    assert gradient[1] == pytest.approx([1, 0, 0])  # the nearest face
+    assert gradient[4] == pytest.approx([1, 0, 0])
+    assert gradient[5] == pytest.approx(np.array([1.5, 2, 0]) / 2.5)
