@@ -34,7 +34,7 @@ def number_after(text: str, words: str) -> float:
 
 
 def test_there_is_one_of_each_number():
-    assert [path.name[:2] for path in SCRIPTS] == [f"{number:02d}" for number in range(1, 13)]
+    assert [path.name[:2] for path in SCRIPTS] == [f"{number:02d}" for number in range(1, 18)]
     table = (FOLDER / "README.md").read_text()
     assert all(f"[{path.name}]({path.name})" in table for path in SCRIPTS)
 
@@ -139,3 +139,56 @@ def test_live_camera():
     lines = text.splitlines()
     assert len(lines) == 8
     assert not any("lost" in line for line in lines)
+
+
+def test_pose_refinement(tmp_path):
+    text = run("13", "--frames", "1", "--out", tmp_path)
+    for method, least in (("Gauss-Newton", 75), ("gradient descent", 50)):
+        twists, euler = (
+            number_after(text, f"{method}, {name}:") for name in ("twists", "Euler angles")
+        )
+        assert least < twists <= 100
+        assert twists >= euler
+    assert (tmp_path / "basin.png").stat().st_size > 10_000
+
+
+def test_camera_calibration(tmp_path):
+    text = run("14", "--quick", "--frames", "4", "--out", tmp_path)
+    start, alone, _, both = (
+        [number_after(line, words) for words in ("off by", "deg,", "focal by")]
+        for line in text.splitlines()
+        if "off by" in line
+    )
+    assert start[0] > 20 and start[1] > 300
+    assert alone[2] == 5
+    assert both[0] < 0.6 and both[1] < 6 and both[2] < 2
+    assert both[1] < alone[1]
+    assert (tmp_path / "calibration.png").stat().st_size > 10_000
+
+
+def test_filter_is_learned(tmp_path):
+    sizes = ("--frames", "3", "--videos", "1", "--points", "128", "--steps", "3")
+    text = run("15", *sizes, "--out", tmp_path)
+    learned = text.split("videos learned from:")[1]
+    before, after = number_after(text, "learned from:"), number_after(learned, "before,")
+    assert 0 < after < before < 20
+    assert (tmp_path / "filter.png").is_file()
+
+
+def test_joint_from_motion(tmp_path):
+    text = run("16", "--frames", "10", "--out", tmp_path)
+    assert "laptop, truth: revolute, axis 0.0" in text
+    assert number_after(text, "laptop, motion: revolute, axis") < 5
+    assert number_after(text.split("laptop, motion:")[1], "pivot") < 20
+    assert number_after(text.split("laptop, motion:")[1], "state") < 1
+    assert number_after(text, "drawer, motion: prismatic, axis") < 10
+    assert number_after(text.split("drawer, motion:")[1], "state") < 6
+    assert (tmp_path / "motion.png").stat().st_size > 10_000
+
+
+def test_sensitivity(tmp_path):
+    text = run("17", "--quick", "--draws", "60", "--out", tmp_path)
+    for line in ("root rotation:", "root translation:", "joint of lid:"):
+        sampled = number_after(text.split(line)[1], "by the Jacobian,")
+        assert number_after(text, line) == pytest.approx(sampled, rel=0.25)
+    assert (tmp_path / "sensitivity.png").stat().st_size > 10_000
