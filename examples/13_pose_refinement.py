@@ -60,10 +60,10 @@ def refine(start, truth, points, labels, to_part, center, size, coordinates, met
     return jnp.degrees(caper.so3.geodesic_distance(pose_of(x)[:3, :3], truth[:3, :3]))
 
 
-def main(frames: int, out: Path) -> None:
+def main(starts: int, out: Path) -> None:
     laptop = caper.categories.get("laptop")
-    sensor = caper.GeneratorConfig(instances=frames, num_points=128)
-    batch = caper.Generator(laptop, sensor, split="test").batch(jax.random.key(4), frames)
+    sensor = caper.GeneratorConfig(instances=8, num_points=128)
+    batch = caper.Generator(laptop, sensor, split="test").batch(jax.random.key(4), 8)
     # Half an object is 1, and the cloud is about its middle: a radian weighs as much as a unit.
     unit, middle = laptop.unit, batch.points.mean(1, keepdims=True)
     pose = caper.se3.from_rt(batch.pose.rotation, (batch.pose.translation - middle) * unit)
@@ -72,7 +72,7 @@ def main(frames: int, out: Path) -> None:
     scene = (*cloud, to_part, batch.pose.box_center * unit, batch.pose.size * unit)
 
     angles = np.linspace(0, 180, 13)
-    axis, shift = jax.random.normal(jax.random.key(5), (2, frames, 1, 16, 3))  # 16 of each angle
+    axis, shift = jax.random.normal(jax.random.key(5), (2, 8, 1, starts, 3))
     axis *= jnp.radians(angles)[:, None, None] / jnp.linalg.norm(axis, axis=-1, keepdims=True)
     away = jnp.concatenate(jnp.broadcast_arrays(axis, 0.1 * shift), -1)
     begin = caper.se3.compose(caper.se3.exp(away), truth[:, None, None])
@@ -95,6 +95,6 @@ def main(frames: int, out: Path) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--starts", type=int, default=16, help="of each angle, per laptop")
     parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     main(**vars(parser.parse_args()))
