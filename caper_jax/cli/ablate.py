@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from caper_jax import machine
 from caper_jax.cli import common
 from caper_jax.cli.common import Count, Settings
 from caper_jax.cli.reproduce import SECTIONS, show_report
@@ -65,6 +66,7 @@ def parse(argv: Sequence[str]) -> Any:
 
 def run(parsed: tuple[Ablate, tuple[str, ...]]) -> int:
     """Runs the command; returns its exit code."""
+    machine.split_cores()
     from caper_jax.reproduce import ablations
     from caper_jax.reproduce.options import Options
 

@@ -13,6 +13,7 @@ from caper_jax.cli.common import Settings
 from caper_jax.cli.train import SECTIONS as TRAINING_SECTIONS
 from caper_jax.cli.train import default_sections
 from caper_jax.errors import CaperError, unknown_name
+from caper_jax.machine import split_cores
 from caper_jax.reproduce.options import Options
 
 if TYPE_CHECKING:
@@ -155,6 +156,8 @@ def run(parsed: tuple[str, Options]) -> int:
         category=tuple(common.chosen_categories(given.category, ())),
         initial=given.initial and common.model_folder(given.initial),
     )
+    if "seeds" in REPRODUCTIONS[name].options:
+        split_cores()  # models are trained side by side
     module = importlib.import_module(f"caper_jax.reproduce.{REPRODUCTIONS[name].module}")
     show_report(module.run(name, options), name, options.out)
     return 0

@@ -36,8 +36,8 @@ class MembersStep:
     Args:
       group: what to train.
       mesh: shares the members among its devices; their number divides M.
-      chunk: members under one vmap on a device, the others follow; None for all of them, or what
-        suits the device.
+      chunk: members under one vmap on a device, the others follow; by default all, and on a CPU one
+        where members have several devices, else two: all at once would leave its caches.
     """
 
     def __init__(
@@ -45,6 +45,9 @@ class MembersStep:
     ) -> None:
         self.group = group
         self._mesh = mesh
+        self._device = jax.local_devices()[0] if mesh is None else mesh.devices.flat[0]
+        if chunk is None and self._device.platform == "cpu":
+            chunk = 2 if mesh is None else 1
         self._chunk = chunk
         self._jitted = self._jit()
         self._statistics = self._jit_statistics()
@@ -116,13 +119,12 @@ class MembersStep:
                 return state, jax.tree.map(lambda x: x[None], metrics)
             return jax.lax.scan(lambda s, x: one(s, x[0], x[1], data), state, (progress, factor))
 
-        device = jax.local_devices()[0] if self._mesh is None else self._mesh.devices.flat[0]
         return jax.jit(
             self._shared(
                 run, (_SPLIT, _EVERYWHERE, _EVERYWHERE), (_SPLIT, PartitionSpec(None, _AXIS))
             ),
             donate_argnums=0,
-            compiler_options=compiler_options(device.platform),
+            compiler_options=compiler_options(self._device.platform),
         )
 
     def _jit_statistics(self) -> Any:

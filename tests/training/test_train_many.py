@@ -76,7 +76,7 @@ def assert_close(a, b):
         assert one.keys() == other.keys()
         off += [abs(one[key] - value) / max(abs(value), 0.01) for key, value in other.items()]
     assert np.quantile(off, 0.8) < 5e-5
-    assert max(off) < 5e-3
+    assert max(off) < 0.02
     for one, other in zip(jax.tree.leaves(a[0]), jax.tree.leaves(b[0]), strict=True):
         np.testing.assert_allclose(
             np.asarray(one, np.float32), np.asarray(other, np.float32), rtol=4e-3, atol=1e-3
