@@ -68,18 +68,20 @@ def content(directory):
 def assert_close(a, b):
     """Of two runs, the metrics; and the weights, which are kept in half precision.
 
-    Rounding may move a point across the gate of the heatmap: some numbers of a step then differ by
-    more than it.
+    The first step differs by rounding alone. Later that may move a point across the gate of the
+    heatmap, or a point's part, so that some numbers of a step differ by more.
     """
-    off = []
-    for one, other in zip(a[1], b[1], strict=True):
-        assert one.keys() == other.keys()
-        off += [abs(one[key] - value) / max(abs(value), 0.01) for key, value in other.items()]
-    assert np.quantile(off, 0.8) < 5e-5
-    assert max(off) < 0.02
+    off = [
+        [abs(one[key] - value) / max(abs(value), 0.01) for key, value in other.items()]
+        for one, other in zip(a[1], b[1], strict=True)
+    ]
+    assert [one.keys() for one in a[1]] == [other.keys() for other in b[1]]
+    assert max(off[0]) < 1e-4
+    assert np.median(off) < 1e-3
+    assert np.max(off) < 0.03
     for one, other in zip(jax.tree.leaves(a[0]), jax.tree.leaves(b[0]), strict=True):
         np.testing.assert_allclose(
-            np.asarray(one, np.float32), np.asarray(other, np.float32), rtol=4e-3, atol=1e-3
+            np.asarray(one, np.float32), np.asarray(other, np.float32), rtol=4e-3, atol=2e-3
         )
 
 
@@ -149,6 +151,24 @@ def test_devices_share_the_members(side_by_side, tmp_path):
     shared = trained(tmp_path, devices=jax.devices()[:3])
     for name in RUNS:
         assert_close(shared[name], side_by_side[name])
+
+
+@pytest.mark.parametrize("seeds", [(3, 4, 5), (3, 4, 3)], ids=["own", "some"])
+def test_devices_have_the_frames_of_their_members(seeds):
+    members = [
+        Member(str(n), override(BASE, f"training.seed={n}", f"training.data_seed={seed}"))
+        for n, seed in enumerate(seeds)
+    ]
+    group = grid.make_group(members, BOX, train_many.draw_banks(members, BOX))
+    variables, data = group.initial_variables(), grid_step.group_data(group)
+    losses = []
+    for mesh in (None, grid_step.members_mesh(3, jax.devices()[:3])):
+        state = jax.device_put(group.initial_state(variables), grid_step.placement(mesh))
+        step = grid_step.MembersStep(group, mesh)
+        _, metrics = step(state, np.zeros(1, np.float32), np.ones(1, np.float32), data)
+        losses.append(np.asarray(metrics["loss"]))
+    assert losses[0].shape == (1, 3) and len(set(losses[0][0].tolist())) == 3
+    np.testing.assert_allclose(losses[1], losses[0], rtol=1e-5)
 
 
 def test_what_memory_does_not_hold_is_trained_in_parts(side_by_side, tmp_path, capsys):
