@@ -73,7 +73,7 @@ def _grid(arguments: argparse.Namespace, count: int) -> tuple[Any, float, int, f
 
     from caper_jax import categories
     from caper_jax.config import preset
-    from caper_jax.training import grid, grid_step, train_many
+    from caper_jax.training import grid, grid_run, grid_step
 
     category = categories.get(arguments.category)
     config = preset(arguments.preset, category.name)
@@ -83,7 +83,7 @@ def _grid(arguments: argparse.Namespace, count: int) -> tuple[Any, float, int, f
         data_seed = seed if arguments.own_data else 0
         own = replace(config.training, seed=seed, data_seed=data_seed)
         members.append(grid.Member(f"seed{seed}", replace(config, training=own)))
-    group = grid.make_group(members, category, train_many.draw_banks(members, category))
+    group = grid.make_group(members, category, grid_run.draw_banks(members, category))
     mesh = grid_step.members_mesh(count)
     state = jax.device_put(
         group.initial_state(group.initial_variables()), grid_step.placement(mesh)

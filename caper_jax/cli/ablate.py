@@ -35,7 +35,7 @@ class Ablate:
 
     Attributes:
       config: TOML file of the study (configs/ablations has examples), or the name of one that
-        ships: ablations, loss, registration, table7, table9, figure11
+        ships: ablations, loss, refiner, registration, table7, table9, figure11
       out: folder of results and runs
       category: a name, several with commas, or all (default: the study's)
       seeds: models of each variant, with the seeds 0, 1, ... (default: the study's)

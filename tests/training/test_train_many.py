@@ -17,7 +17,7 @@ from caper_jax.config import GeneratorConfig, LoaderConfig, RunConfig, TrainingC
 from caper_jax.errors import CaperError
 from caper_jax.models.files import read_model
 from caper_jax.synthetic.frames import Generator
-from caper_jax.training import grid, grid_step, train_many
+from caper_jax.training import grid, grid_run, grid_step, train_many
 from caper_jax.training import train as training
 from caper_jax.training.grid import Member
 from caper_jax.training.run_directory import read_metrics
@@ -128,6 +128,27 @@ def test_an_interrupted_grid_ends_with_the_same_bits(side_by_side, tmp_path, mon
         assert_same_bits(again[name], side_by_side[name])
 
 
+def test_a_grid_that_was_killed_while_it_wrote_models_trains_none_again(
+    side_by_side, tmp_path, monkeypatch
+):
+    write, written = grid_run.write_run, []
+
+    def break_off(*arguments):
+        if written:
+            raise OSError("disk full")
+        written.append(write(*arguments))
+
+    monkeypatch.setattr(grid_run, "write_run", break_off)
+    with pytest.raises(OSError, match="disk full"):
+        trained(tmp_path)
+    monkeypatch.setattr(grid_run, "write_run", write)
+    monkeypatch.setattr(grid_step.MembersStep, "__call__", None)  # no step is taken
+    again = trained(tmp_path)
+    for name in RUNS:
+        assert_same_bits(again[name], side_by_side[name])
+    assert not list((tmp_path / "programs").iterdir())
+
+
 def test_a_diverging_member_leaves_the_others_alone(side_by_side, tmp_path, capsys):
     runs = RUNS | {"second": override(RUNS["second"], "training.learning_rate=1e30")}
     results = train_many.train_many(runs, tmp_path, devices=jax.devices()[:1])
@@ -159,7 +180,7 @@ def test_devices_have_the_frames_of_their_members(seeds):
         Member(str(n), override(BASE, f"training.seed={n}", f"training.data_seed={seed}"))
         for n, seed in enumerate(seeds)
     ]
-    group = grid.make_group(members, BOX, train_many.draw_banks(members, BOX))
+    group = grid.make_group(members, BOX, grid_run.draw_banks(members, BOX))
     variables, data = group.initial_variables(), grid_step.group_data(group)
     losses = []
     for mesh in (None, grid_step.members_mesh(3, jax.devices()[:3])):
@@ -210,7 +231,7 @@ def test_shapes_ask_for_programs_of_their_own():
         ["e"],
     ]
     with pytest.raises(CaperError, match=r"network\.joints .*voting in a, direct in b"):
-        grid.make_group(members[:2], BOX, train_many.draw_banks(members[:2], BOX))
+        grid.make_group(members[:2], BOX, grid_run.draw_banks(members[:2], BOX))
 
 
 @pytest.mark.parametrize("change", ["network.increment=euclidean", "category=laptop"])
@@ -248,7 +269,7 @@ def test_every_member_sees_the_frames_of_its_single_run(changes, sharing):
     """Disturbances and sensors are traced where they differ; frames stay the same."""
     base = override(BASE, "data.occlusion=0.9", "data.holes=0.5")
     members = [Member(str(n), override(base, *change)) for n, change in enumerate(changes)]
-    group = grid.make_group(members, BOX, train_many.draw_banks(members, BOX))
+    group = grid.make_group(members, BOX, grid_run.draw_banks(members, BOX))
     assert group.sharing == sharing
     step = jnp.int32(5)
     draw = jax.jit(lambda streams: grid_step.draw_batches(group, streams, step))
