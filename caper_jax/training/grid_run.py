@@ -132,6 +132,8 @@ class ProgramRunner:
         if not result.finished:
             return False
         trained = with_own_statistics(result.state, step.statistics, lambda _: data)
+        # To the host first: a row of an array on several devices is a program on all of them.
+        trained = jax.device_get(trained)
         self._write(members, starts, trained, logs[0].diverged)
         shutil.rmtree(folder)  # what it was needed for is written
         return True
