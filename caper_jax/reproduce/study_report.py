@@ -26,11 +26,13 @@ class Metric:
       label: with its unit.
       digits: shown.
       of: errors of a model -> the value; None where it has no meaning.
+      drawn: whether the picture has a panel for it.
     """
 
     label: str
     digits: int
     of: Callable[[Errors], float | None]
+    drawn: bool = False
 
 
 def metrics_of(study: Study) -> tuple[Metric, ...]:
@@ -76,28 +78,31 @@ def _angle(name: str) -> Callable[[Errors], float | None]:
 
 
 _METRICS = (
-    Metric("root rotation, median [deg]", 2, _root("rotation_deg", "median")),
-    Metric("root rotation, mean [deg]", 2, _root("rotation_deg", "mean")),
+    Metric("root rotation, median [deg]", 2, _root("rotation_deg", "median"), drawn=True),
+    Metric("root rotation, mean [deg]", 2, _root("rotation_deg", "mean"), drawn=True),
     Metric("root over 30 deg [%]", 1, _turned),
     Metric(
         "other parts' rotation, median [deg]", 2, _mean_over("parts", 1, "rotation_deg", "median")
     ),
     Metric("root translation, median [%]", 2, _root("translation_relative", "median", 100.0)),
     Metric("joint axis, median [deg]", 2, _mean_over("joints", 0, "axis_deg", "median")),
-    Metric("joint pivot, median [mm]", 1, _mean_over("joints", 0, "pivot_m", "median", 1000.0)),
-    Metric("joint state, median [deg or mm]", 2, _state),
+    Metric(
+        "joint pivot, median [mm]",
+        1,
+        _mean_over("joints", 0, "pivot_m", "median", 1000.0),
+        drawn=True,
+    ),
+    Metric("joint state, median [deg or mm]", 2, _state, drawn=True),
 )
 _ROOT_METRICS = (
-    Metric("rotation, median [deg]", 2, _root("rotation_deg", "median")),
-    Metric("rotation, mean [deg]", 2, _root("rotation_deg", "mean")),
+    Metric("rotation, median [deg]", 2, _root("rotation_deg", "median"), drawn=True),
+    Metric("rotation, mean [deg]", 2, _root("rotation_deg", "mean"), drawn=True),
     Metric("translation, median [%]", 2, _root("translation_relative", "median", 100.0)),
     *(
         Metric(f"{name}, median [deg]", 2, _angle(name))
         for name in (*ANGLES, "first axis", "second axis")
     ),
 )
-# Columns of the comparison, and panels of the picture.
-_COMPARED = 2
 
 
 def study_report(result: StudyResult, facts: Sequence[str] = ()) -> Report:
@@ -112,7 +117,7 @@ def study_report(result: StudyResult, facts: Sequence[str] = ()) -> Report:
     known = list(dict.fromkeys(one.run.category for one in result.measured))
     rows, compared = [], []
     content: dict[str, Any] = {}
-    intervals: dict[str, dict[str, Comparison]] = {m.label: {} for m in metrics}
+    intervals: dict[str, dict[str, Comparison]] = {m.label: {} for m in metrics if m.drawn}
     for category in known:
         of_variant = {
             variant: [
@@ -135,7 +140,7 @@ def study_report(result: StudyResult, facts: Sequence[str] = ()) -> Report:
                 label: asdict(one) for label, one in found.items() if one is not None
             }
             for metric in metrics:
-                if (one := found[metric.label]) is not None:
+                if metric.drawn and (one := found[metric.label]) is not None:
                     intervals[metric.label][f"{variant}, {category}"] = one
             compared += _comparison_rows(category, variant, found, metrics)
     header = ("category", "variant", "models", *(metric.label for metric in metrics))
@@ -234,7 +239,7 @@ def _pictures(study: Study, intervals: dict[str, dict[str, Comparison]]) -> dict
             for name, one in found.items()
             if one.low is not None and one.high is not None
         }
-        for label, found in list(intervals.items())[:_COMPARED]
+        for label, found in intervals.items()
     }
     panels = {label: found for label, found in panels.items() if found}
     title = f"{study.title}: difference to {study.baseline!r}, 95 % intervals"

@@ -134,7 +134,8 @@ def _draw_scatter(figure: Figure, scatter: Scatter) -> None:
 def _draw_intervals(figure: Figure, intervals: Intervals) -> None:
     """One row per name, top to bottom; those that leave out zero are darker."""
     names = list(dict.fromkeys(name for panel in intervals.panels.values() for name in panel))
-    figure.set_size_inches(_SIZE[0], max(_SIZE[1], 1.5 + 0.28 * len(names)))
+    width = max(_SIZE[0], 2.0 + 2.6 * len(intervals.panels))
+    figure.set_size_inches(width, max(_SIZE[1], 1.5 + 0.28 * len(names)))
     panels = figure.subplots(1, len(intervals.panels), sharey=True, squeeze=False)[0]
     for axes, (label, values) in zip(panels, intervals.panels.items(), strict=True):
         axes.axvline(0.0, color="0.4", linewidth=1.0)
