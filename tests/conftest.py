@@ -34,6 +34,7 @@ LONGEST = (
     "test_tracker",
     "test_estimator",
     "test_train",
+    "test_train_many",
     "test_objective",
     "test_benchmarks",
     "test_step",
