@@ -69,7 +69,7 @@ def main(frames: int, videos: int, points: int, steps: int, out: Path) -> None:
     for _ in range(steps + 1):
         (value, gradient), (other, _) = (value_and_grad(logarithms, x) for x in (learn, held_out))
         curve.append((value, other))
-        print(value, other, gradient, flush=True)
+        print(f"step {len(curve) - 1}: {value:.3f} deg, held out {other:.3f}", flush=True)
         used = logarithms
         updates, state = adam.update(gradient, state)
         logarithms = optax.apply_updates(logarithms, updates)
