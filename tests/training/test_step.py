@@ -13,7 +13,7 @@ from _helpers.tiny import network, random_variables
 from caper_jax.config import LossConfig, LossWeights
 from caper_jax.training.objective import Objective
 from caper_jax.training.optimizer import Optimizer
-from caper_jax.training.step import TrainState, loss_key, train_step
+from caper_jax.training.step import TrainState, data_key, loss_key, train_step
 
 SEEDS = jnp.arange(3, dtype=jnp.uint32)
 
