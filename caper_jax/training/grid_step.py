@@ -23,7 +23,7 @@ from caper_jax.training.step import TrainState, compiler_options, data_key, trai
 PyTree = Any
 Metrics = dict[str, Array]
 _AXIS = "members"
-_EVERYWHERE, _SPLIT = PartitionSpec(), PartitionSpec(_AXIS)
+EVERYWHERE, SPLIT = PartitionSpec(), PartitionSpec(_AXIS)
 
 
 class MembersStep:
@@ -120,8 +120,12 @@ class MembersStep:
             return jax.lax.scan(lambda s, x: one(s, x[0], x[1], data), state, (progress, factor))
 
         return jax.jit(
-            self._shared(
-                run, (_SPLIT, _EVERYWHERE, _EVERYWHERE), (_SPLIT, PartitionSpec(None, _AXIS))
+            on_devices(
+                run,
+                group,
+                self._mesh,
+                (SPLIT, EVERYWHERE, EVERYWHERE),
+                (SPLIT, PartitionSpec(None, _AXIS)),
             ),
             donate_argnums=0,
             compiler_options=compiler_options(self._device.platform),
@@ -147,21 +151,36 @@ class MembersStep:
             states = (model_state, weights, seed)
             return over_members(own, (states, numbers), batch, axis, self._chunk)
 
-        return jax.jit(self._shared(run, (_SPLIT, _SPLIT, _SPLIT, _EVERYWHERE), _SPLIT))
+        return jax.jit(on_devices(run, group, self._mesh, (SPLIT, SPLIT, SPLIT, EVERYWHERE), SPLIT))
 
-    def _shared(self, function: Any, in_specs: tuple[PartitionSpec, ...], out_specs: Any) -> Any:
-        """A function whose last argument is ``group_data``, with its members on all devices."""
-        if self._mesh is None:
-            return function
-        streams = _SPLIT if self.group.sharing == "own" else _EVERYWHERE
-        # Custom gradients hide from the check what is the same on all devices.
-        return jax.shard_map(
-            function,
-            mesh=self._mesh,
-            in_specs=(*in_specs, (streams, _SPLIT, _SPLIT)),
-            out_specs=out_specs,
-            check_vma=False,
-        )
+
+def on_devices(
+    function: Any,
+    group: Group,
+    mesh: jax.sharding.Mesh | None,
+    in_specs: tuple[PartitionSpec, ...],
+    out_specs: Any,
+) -> Any:
+    """A function of members with each device's own on it; unchanged without a mesh.
+
+    Args:
+      function: its last argument is ``group_data``.
+      group: of the members.
+      mesh: from ``members_mesh``.
+      in_specs: of the other arguments.
+      out_specs: of the result.
+    """
+    if mesh is None:
+        return function
+    streams = SPLIT if group.sharing == "own" else EVERYWHERE
+    # Custom gradients hide from the check what is the same on all devices.
+    return jax.shard_map(
+        function,
+        mesh=mesh,
+        in_specs=(*in_specs, (streams, SPLIT, SPLIT)),
+        out_specs=out_specs,
+        check_vma=False,
+    )
 
 
 def over_members(
@@ -246,4 +265,4 @@ def placement(mesh: jax.sharding.Mesh | None) -> jax.sharding.Sharding:
     """Where the states of a group lie."""
     if mesh is None:
         return jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-    return NamedSharding(mesh, _SPLIT)
+    return NamedSharding(mesh, SPLIT)
