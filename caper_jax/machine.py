@@ -21,15 +21,19 @@ def machine() -> dict[str, Any]:
     """Processor, cores, load, version of JAX and device."""
     import jax
 
-    # What this process may use, where the system says so.
-    affinity = getattr(os, "sched_getaffinity", None)
     return {
         "processor": processor(),
-        "cores": os.cpu_count() if affinity is None else len(affinity(0)),
+        "cores": cores(),
         "load_average": load_average(),
         "jax": jax.__version__,
         "device": f"{jax.devices()[0].device_kind} x {jax.device_count()}",
     }
+
+
+def cores() -> int | None:
+    """How many cores this process may use; all there are where the system does not say."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return os.cpu_count() if affinity is None else len(affinity(0))
 
 
 def processor() -> str:
@@ -70,10 +74,8 @@ def split_cores(environment: Mapping[str, str] = os.environ) -> None:
         return
     import jax
 
-    affinity = getattr(os, "sched_getaffinity", None)
-    cores = os.cpu_count() or 1 if affinity is None else len(affinity(0))
     try:
-        jax.config.update("jax_num_cpu_devices", cores)
+        jax.config.update("jax_num_cpu_devices", cores() or 1)
     except RuntimeError:  # too late
         return
 

@@ -19,6 +19,7 @@ from caper_jax.data.clouds import MIN_POINTS, sample_points
 from caper_jax.data.types import Dataset, Frame
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, estimate, load
+from caper_jax.evaluation.batches import is_finite
 from caper_jax.evaluation.loading import cloud_of, stack
 from caper_jax.evaluation.metrics import pose_errors
 from caper_jax.evaluation.report import error_tables
@@ -142,8 +143,7 @@ def _cloud(frame: Frame, num_points: int, root_input: str) -> np.ndarray:
 def _errors(
     run: Run, pose: ArticulatedPose, truth: ArticulatedPose, category: Category, root_alone: bool
 ) -> Measured:
-    finite = [np.isfinite(leaf).reshape(len(leaf), -1).all(1) for leaf in vars(pose).values()]
-    failed = ~np.all(finite, axis=0)
+    failed = ~is_finite(pose)
     tables = error_tables(pose_errors(pose, truth, category, failed), category)
     if not root_alone:
         return Measured(run, tables)

@@ -222,8 +222,8 @@ def make_group(members: Sequence[Member], category: Category, banks: Banks) -> G
     streams = Streams(
         seed=jnp.asarray([seed for seed, _ in different], jnp.uint32),
         rates=jax.tree.map(jnp.asarray, rates),
-        mix=_stack(mixes) if stacked else mixes[0],
-        bank=_stack(seen) if stacked else seen[0],
+        mix=stack(mixes) if stacked else mixes[0],
+        bank=stack(seen) if stacked else seen[0],
     )
     if not stacked:
         streams = streams.replace(seed=streams.seed[0])  # type: ignore[attr-defined]
@@ -255,7 +255,8 @@ def _replaced(config: Any, path: list[str], value: Any) -> Any:
     return replace(config, **{name: value})
 
 
-def _stack(trees: Sequence[PyTree]) -> PyTree:
+def stack(trees: Sequence[PyTree]) -> PyTree:
+    """Trees of equal shapes as one, with a leading axis."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 

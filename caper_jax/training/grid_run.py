@@ -24,7 +24,7 @@ from caper_jax.machine import free_bytes
 from caper_jax.synthetic.frames import draw_frames
 from caper_jax.synthetic.instances import build_bank, draw_instances
 from caper_jax.synthetic.sensor import sensor_mix
-from caper_jax.training.grid import Banks, Group, Member, make_group
+from caper_jax.training.grid import Banks, Group, Member, make_group, stack
 from caper_jax.training.grid_step import MembersStep, group_data, members_mesh, placement
 from caper_jax.training.loop import run_steps
 from caper_jax.training.member_logs import MemberLogs
@@ -32,7 +32,6 @@ from caper_jax.training.statistics import with_own_statistics
 from caper_jax.training.step import TrainState
 from caper_jax.training.train import SAMPLE, Start, is_complete, start_from, write_run
 
-PyTree = Any
 _DIVERGED_FILE = "diverged.json"
 _PROGRAMS = "programs"  # folder of what is being trained: its members and checkpoints
 _PROGRAM_FILE = "program.json"
@@ -111,7 +110,7 @@ class ProgramRunner:
         mesh = members_mesh(len(members), self.devices)
         place = placement(mesh)
         starts = self._starts(group)
-        variables = _stack([start.variables for start in starts])
+        variables = stack([start.variables for start in starts])
         state = jax.device_put(group.initial_state(variables), place)
         step = MembersStep(group, mesh)
         parts = self._parts(folder, step, state)
@@ -207,7 +206,3 @@ class ProgramRunner:
             )
         )
         return draw(jax.random.key(member.config.training.stream), bank=self.banks[member.bank])
-
-
-def _stack(trees: Sequence[PyTree]) -> PyTree:
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)

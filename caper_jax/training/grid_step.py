@@ -18,7 +18,7 @@ from caper_jax.training.grid import Group, Streams, with_numbers
 from caper_jax.training.objective import Objective
 from caper_jax.training.optimizer import Optimizer
 from caper_jax.training.statistics import updated_statistics
-from caper_jax.training.step import TrainState, compiler_options, data_key, train_step
+from caper_jax.training.step import TrainState, compiler_options, data_key, in_turn, train_step
 
 PyTree = Any
 Metrics = dict[str, Array]
@@ -113,15 +113,9 @@ class MembersStep:
 
             return over_members(own, (state, numbers), batch, axis, self._chunk)
 
-        def run(state: TrainState, progress: Array, factor: Array, data: PyTree):
-            if progress.shape[0] == 1:  # no loop: as in ``step.compile_step``
-                state, metrics = one(state, progress[0], factor[0], data)
-                return state, jax.tree.map(lambda x: x[None], metrics)
-            return jax.lax.scan(lambda s, x: one(s, x[0], x[1], data), state, (progress, factor))
-
         return jax.jit(
             on_devices(
-                run,
+                in_turn(one),
                 group,
                 self._mesh,
                 (SPLIT, EVERYWHERE, EVERYWHERE),

@@ -217,12 +217,6 @@ def compile_step(
             value_and_grad=gradient,
         )
 
-    def run(state: TrainState, progress: jax.Array, factor: jax.Array, data: PyTree = None):
-        if progress.shape[0] == 1:  # no loop: XLA for CPU runs less of a loop's body in parallel
-            state, metrics = one(state, progress[0], factor[0], data)
-            return state, jax.tree.map(lambda x: x[None], metrics)
-        return jax.lax.scan(lambda s, x: one(s, x[0], x[1], data), state, (progress, factor))
-
     device = jax.local_devices()[0] if mesh is None else mesh.devices.flat[0]
     options: dict[str, Any] = {"compiler_options": compiler_options(device.platform)}
     if mesh is not None:
@@ -230,7 +224,19 @@ def compile_step(
         given = everywhere if batch_fn is not None else parallel.batch_sharding(mesh)
         options["in_shardings"] = (everywhere, everywhere, everywhere, given)
         options["out_shardings"] = everywhere
-    return jax.jit(run, donate_argnums=0, **options)
+    return jax.jit(in_turn(one), donate_argnums=0, **options)
+
+
+def in_turn(one: Callable[..., tuple[PyTree, PyTree]]) -> Callable[..., tuple[PyTree, PyTree]]:
+    """``run(state, progress, factor, data)`` of n steps, from one: see ``compile_step``."""
+
+    def run(state: PyTree, progress: jax.Array, factor: jax.Array, data: PyTree = None):
+        if progress.shape[0] == 1:  # no loop: XLA for CPU runs less of a loop's body in parallel
+            state, metrics = one(state, progress[0], factor[0], data)
+            return state, jax.tree.map(lambda x: x[None], metrics)
+        return jax.lax.scan(lambda s, x: one(s, x[0], x[1], data), state, (progress, factor))
+
+    return run
 
 
 _LEAST_MEMORY = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
