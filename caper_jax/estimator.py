@@ -21,8 +21,10 @@ from caper_jax.articulation.pose import Array, ArticulatedPose, joints_in_camera
 from caper_jax.config import NetworkConfig, from_dict
 from caper_jax.data.clouds import MIN_POINTS, are_sampled, sample_points
 from caper_jax.errors import CaperError
+from caper_jax.models import hypotheses as readings
 from caper_jax.models import uncertainty
 from caper_jax.models.files import CARD_FILE, flatten, read_model
+from caper_jax.models.hypotheses import MOST, Hypotheses, ReadingScorer, state_hypotheses
 from caper_jax.models.observation import observe
 from caper_jax.models.parts import PartsNetwork
 from caper_jax.models.pipeline import articulated_pose, refinements, run_stages
@@ -67,6 +69,8 @@ class Prediction:
         radians and meters; the truth lies within 2.5 of them nine times in ten. None, as is the
         next, where the model is not calibrated. See ``uncertainty.pose_covariance``.
       state_std: radians or meters; the truth lies within 1.64 of them nine times in ten.
+      hypotheses: the readings of the cloud that are likeliest, H of them, with probabilities; the
+        first is ``pose``. None where the model was not fitted to tell.
     """
 
     pose: ArticulatedPose
@@ -84,6 +88,7 @@ class Prediction:
     rotation_std: Float[Array, "*batch K"] = None
     translation_std: Float[Array, "*batch K"] = None
     state_std: Float[Array, "*batch J"] = None
+    hypotheses: Hypotheses | None = None
 
     def joints_in_camera(
         self,
@@ -98,6 +103,8 @@ def estimate(
     category: Category,
     network: NetworkConfig,
     calibration: Calibration | None = None,
+    gravity: Float[ArrayLike, "B 3"] | None = None,
+    hypotheses: int = 1,
 ) -> Prediction:
     """The pure function under ``Estimator``: jit, vmap and differentiate it at will.
 
@@ -112,12 +119,18 @@ def estimate(
       category: static.
       network: static.
       calibration: gives the standard deviations.
+      gravity: [B, 3] unit vectors in the camera frame, the way things fall; zeros where it is
+        unknown. Clouds are leveled by it, whatever roll the camera has, and objects that stand as
+        they are used are not read as lying (``Category.stands``).
+      hypotheses: static, H readings to state, at most 4. With 1 only the probability of the answer
+        is computed, at no cost; more cost up to half as much again, where the answer is in doubt.
 
     Returns:
       Prediction with leading axis B and M = N.
 
     Raises:
-      CaperError: points of another shape, or no floats.
+      CaperError: points or gravity of another shape, no floats, or more readings than a model can
+        state: one that was not fitted for it can state one.
     """
     if jnp.ndim(points) != 3 or jnp.shape(points)[-1] != 3:
         raise CaperError(f"points must be [B, N, 3], got {jnp.shape(points)}")
@@ -126,9 +139,14 @@ def estimate(
         raise CaperError(f"points must be floats, in meters, got {points.dtype}")
     # Moments of points cancel in half precision, without any NaN.
     points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
-    observed = observe(points, category)
+    _check_number(hypotheses, variables)
+    if gravity is not None:
+        if jnp.shape(gravity) != (len(points), 3):
+            raise CaperError(f"gravity must be [{len(points)}, 3], got {jnp.shape(gravity)}")
+        gravity = jnp.asarray(gravity, points.dtype)
+    observed = observe(points, category, gravity)
     cloud = observed.cloud
-    outputs = run_stages(variables, cloud, category, network)
+    outputs = run_stages(variables, cloud, category, network, observed.gravity)
     refined = refinements(variables, outputs, cloud, category, network)[-1]
     labels = outputs.segmentation.argmax(-1).astype(jnp.int32)
     labels = observed.selection.spread_labels(labels)
@@ -148,6 +166,11 @@ def estimate(
         evidence=jnp.concatenate([outputs.evidence, fit.evidence], axis=-1),
         plausibility=None if verdict.score is None else jax.nn.sigmoid(verdict.score),
     )
+    if "hypotheses" in variables["params"]:
+        stated = state_hypotheses(
+            variables, observed, outputs, refined, fit, category, network, hypotheses
+        )
+        prediction = prediction.replace(hypotheses=stated)  # type: ignore[attr-defined]
     if calibration is None:
         return prediction
     rotation, translation, state = uncertainty.radii(calibration, prediction.evidence)
@@ -164,6 +187,17 @@ def estimate(
     )
 
 
+def _check_number(hypotheses: int, variables: dict[str, Any]) -> None:
+    """Raises CaperError unless a model can state so many readings."""
+    if not 1 <= hypotheses <= MOST:
+        raise CaperError(f"hypotheses must be from 1 to {MOST}, got {hypotheses}")
+    if hypotheses > 1 and "hypotheses" not in variables["params"]:
+        raise CaperError(
+            f"the model was not fitted to state {hypotheses} hypotheses; fit it with caper "
+            "calibrate, or ask for 1"
+        )
+
+
 class Estimator:
     """A trained model of one category, for clouds on the host.
 
@@ -176,7 +210,8 @@ class Estimator:
       variables: weights, as ``estimate`` takes them.
       card: what the model was trained on, where and for how long.
       calibration: what its standard deviations follow from, if the card has it.
-      function: ``(variables, points [B, N, 3]) -> Prediction``, pure.
+      hypotheses: how many readings it states.
+      function: ``(variables, points [B, N, 3], gravity=None) -> Prediction``, pure.
     """
 
     def __init__(
@@ -185,9 +220,12 @@ class Estimator:
         network: NetworkConfig,
         variables: dict[str, Any],
         card: dict[str, Any] | None = None,
+        hypotheses: int = 1,
     ) -> None:
+        _check_number(hypotheses, variables)
         self.category = category
         self.network = network
+        self.hypotheses = hypotheses
         self.variables = jax.device_put(variables)
         self.card = card or {}
         self.calibration = None
@@ -196,11 +234,15 @@ class Estimator:
             section = self.card["calibration"]
             self.calibration = uncertainty.from_card(section, category.num_parts, source)
         self.function = partial(
-            estimate, category=category, network=network, calibration=self.calibration
+            estimate,
+            category=category,
+            network=network,
+            calibration=self.calibration,
+            hypotheses=hypotheses,
         )
         self._jitted = jax.jit(self.function)
 
-    def __call__(self, points: Any) -> Prediction:
+    def __call__(self, points: Any, gravity: Any = None) -> Prediction:
         """Estimates one cloud or a batch.
 
         Any number of points is taken: clouds are sampled to what the networks see, so that a
@@ -210,20 +252,26 @@ class Estimator:
 
         Args:
           points: [N, 3] or [B, N, 3] meters, camera frame (OpenCV), in any order.
+          gravity: [3] or [B, 3], the way things fall, in the camera frame and of any length: (0, 1,
+            0) for a level camera. An accelerometer at rest gives the opposite. By default the
+            camera is taken to be level within 15 deg.
 
         Returns:
           Prediction with the leading axes of ``points``.
 
         Raises:
-          CaperError: wrong shape or dtype, fewer than 48 usable points that differ, or points in
-            millimeters.
+          CaperError: wrong shape or dtype, fewer than 48 usable points that differ, points in
+            millimeters, or a gravity that is no direction.
         """
         if isinstance(points, jax.core.Tracer):
             _check_shape(points.shape)
             clouds = points if points.ndim == 3 else points[None]
-            prediction = self.function(self.variables, clouds)
+            down = None if gravity is None else jnp.broadcast_to(gravity, (len(clouds), 3))
+            prediction = self.function(self.variables, clouds, gravity=down)
         else:
-            prediction = self._jitted(self.variables, self.sampled(points))
+            sampled = self.sampled(points)
+            unit = None if gravity is None else unit_gravity(gravity, len(sampled))
+            prediction = self._jitted(self.variables, sampled, gravity=unit)
         if np.ndim(points) == 3:
             return prediction
         return jax.tree.map(lambda array: array[0], prediction)
@@ -258,6 +306,28 @@ class Estimator:
         )
 
 
+def unit_gravity(gravity: Any, batch: int) -> Float[np.ndarray, "B 3"]:
+    """Directions of gravity as unit vectors, one per cloud.
+
+    Args:
+      gravity: [3] or [B, 3], of any length.
+      batch: B.
+
+    Raises:
+      CaperError: another shape, or a vector that is zero or not finite.
+    """
+    try:
+        down = np.broadcast_to(np.asarray(gravity, np.float64), (batch, 3))
+    except (TypeError, ValueError) as error:
+        raise CaperError(
+            f"gravity must be three numbers, or three for each of {batch} clouds ({error})"
+        ) from error
+    length = np.linalg.norm(down, axis=-1, keepdims=True)
+    if not (np.isfinite(length) & (length > 1e-6)).all():
+        raise CaperError(f"gravity must be a direction in the camera frame, got {down.tolist()}")
+    return (down / length).astype(np.float32)
+
+
 def _check_shape(shape: tuple[int, ...]) -> None:
     """Raises CaperError unless the shape is one cloud's or a batch's."""
     if len(shape) not in (2, 3) or shape[-1] != 3:
@@ -282,6 +352,7 @@ def load(
     object_scale: float = 1.0,
     camera_roll: float = 0.0,
     calibrated: bool = True,
+    hypotheses: int = 1,
 ) -> Estimator:
     """The estimator of a category.
 
@@ -296,6 +367,7 @@ def load(
         for a camera upside down; the shipped models know level cameras, within 15 deg.
       calibrated: whether to read the calibration in the card; without it, or where there is none,
         there are no standard deviations.
+      hypotheses: how many readings of a cloud to state, at most 4; see ``Prediction.hypotheses``.
 
     Raises:
       CaperError: unknown category, no model of it in the package, a damaged model, or one of
@@ -322,7 +394,8 @@ def load(
         card = {name: value for name, value in card.items() if name != "calibration"}
     network = network_of(card, directory)
     _check_variables(directory, variables, definition, network)
-    return Estimator(definition.scaled(object_scale).rolled(camera_roll), network, variables, card)
+    definition = definition.scaled(object_scale).rolled(camera_roll)
+    return Estimator(definition, network, variables, card, hypotheses)
 
 
 def network_of(card: dict[str, Any], directory: Path) -> NetworkConfig:
@@ -352,6 +425,10 @@ def _check_variables(directory: Path, variables, category: Category, network: Ne
     if "plausibility" in variables.get("params", {}):
         features = jax.ShapeDtypeStruct((2, num_fit_features(parts)), jnp.float32)
         modules["plausibility"] = PlausibilityClassifier(), features, {}
+    if "hypotheses" in variables.get("params", {}):
+        features = jax.ShapeDtypeStruct((2, readings.num_features(parts)), jnp.float32)
+        classes = np.zeros(2, np.int32)
+        modules["hypotheses"] = ReadingScorer(), features, {"rotation_class": classes}
     collections = ["params", "batch_stats"]
     try:
         # Without a key: drawing random weights takes longer to trace than the networks.

@@ -112,6 +112,8 @@ class Category:
       shape: draws an instance from a numpy generator; None when only real data exist.
       viewpoint: cameras of generated frames.
       symmetries: declared ambiguities.
+      stands: whether such objects stand as they are used, ``viewpoint.up`` against gravity; False
+        where they lie as they like, so that gravity says nothing of their rotation.
       closed: the limit at which a joint is closed; None where that means nothing.
       urdf_rule: how objects in URDF files become this category's; no rule takes the file's state 0
         as the rest pose, z as up and x as the front.
@@ -129,6 +131,7 @@ class Category:
     shape: Callable[[np.random.Generator], ObjectModel] | None = None
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
     symmetries: tuple[Symmetry, ...] = ()
+    stands: bool = True
     closed: Literal["low", "high"] | None = "low"
     # Compiled functions do not depend on it: it is no part of equality or of the hash.
     urdf_rule: UrdfRule = field(default_factory=UrdfRule, compare=False)

@@ -328,6 +328,7 @@ CUTTER = Category(
     parts=("body", "blade"),
     joints=(Joint("prismatic", parent=0, limits=(0.0, _LONGEST)),),
     directions=("x", "y"),
+    stands=False,
     directions_reason="the long way of the handle shows x, the slider and the flat face show y",
     unit=13.8,
     mean_size=((0.141, 0.015, 0.029), (0.114, 0.013, 0.017)),

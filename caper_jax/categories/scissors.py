@@ -361,6 +361,7 @@ SCISSORS = Category(
     parts=("root blade", "other blade"),
     joints=(Joint("revolute", parent=0, limits=(_CLOSED - _REST, _WIDE - _REST)),),
     directions=("x", "y"),
+    stands=False,
     directions_reason="the way to the tips and the normal of the flat face show at any opening",
     unit=10.6,
     mean_size=((0.164, 0.01, 0.06), (0.151, 0.01, 0.063)),

@@ -321,6 +321,7 @@ STAPLER = Category(
     parts=("base", "arm"),
     joints=(Joint("revolute", parent=0, limits=(0.0, _OPEN)),),
     directions=("y", "z"),
+    stands=False,
     directions_reason="mirror-symmetric in the y-z plane, so y and z are what the shape shows",
     unit=10.4,
     mean_size=((0.04, 0.028, 0.176), (0.03, 0.031, 0.175)),

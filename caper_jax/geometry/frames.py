@@ -10,6 +10,8 @@ from jaxtyping import Array, Bool, Float
 
 from caper_jax.lie.linalg import transpose
 
+_STEEP = np.sin(np.radians(3.0)) ** 2  # gravity this near to the optical axis levels nothing
+
 
 def _cube_rotations() -> np.ndarray:
     """[24, 3, 3] signed permutation matrices of determinant one, the identity first."""
@@ -71,6 +73,23 @@ def view_rotation(points: Float[Array, "B N 3"], roll: float = 0.0) -> Float[Arr
         [-x * y * share, 1.0 - y * y * share, -y],
         [x, y, z],
     ]
+    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+
+
+def level_rotation(gravity: Float[Array, "B 3"]) -> Float[Array, "B 3 3"]:
+    """The rotation about the optical axis after which gravity points down the image, along +y.
+
+    Args:
+      gravity: in the frame to level, of any length; zeros where it is unknown. There, and within 3
+        deg of the optical axis, where no direction of the image is down, nothing is rotated.
+    """
+    x, y = gravity[:, 0], gravity[:, 1]
+    across = jnp.square(x) + jnp.square(y)
+    known = across > _STEEP * jnp.square(gravity).sum(-1)
+    length = jnp.sqrt(jnp.where(known, across, 1.0))
+    cos, sin = jnp.where(known, y / length, 1.0), jnp.where(known, x / length, 0.0)
+    zero, one = jnp.zeros_like(cos), jnp.ones_like(cos)
+    rows = [[cos, -sin, zero], [sin, cos, zero], [zero, zero, one]]
     return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 

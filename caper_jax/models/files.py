@@ -19,9 +19,8 @@ from caper_jax.files import write_atomically
 PyTree = Any
 WEIGHTS_FILE = "weights.npz"
 CARD_FILE = "model.json"
-# A file of its own: fitted anew more often than the networks are trained, and a hundredth as large.
-PLAUSIBILITY_FILE = "plausibility.npz"
-_PLAUSIBILITY = "params/plausibility/"
+# Files of their own: fitted anew more often than the networks are trained, a hundredth as large.
+FITTED_FILES = {"plausibility": "plausibility.npz", "hypotheses": "hypotheses.npz"}
 
 
 @dataclass(frozen=True)
@@ -37,6 +36,7 @@ class CardFields:
       calibration: see ``models.uncertainty``.
       refiner: what the refiner was fitted on.
       plausibility: what the classifier of plausibility was fitted on.
+      hypotheses: what the probabilities of readings were fitted on.
       complete: which run it is of, once all that belongs to the model is written.
     """
 
@@ -52,6 +52,7 @@ class CardFields:
     calibration: dict[str, Any] | None = None
     refiner: dict[str, Any] | None = None
     plausibility: dict[str, Any] | None = None
+    hypotheses: dict[str, Any] | None = None
     complete: str | None = None
 
 
@@ -61,7 +62,7 @@ _HALF_TOLERANCE = 1e-3  # relative; float16 itself keeps 5e-4 where it is not su
 def write_model(directory: str | Path, variables: PyTree, card: dict[str, Any]) -> None:
     """Write ``weights.npz`` and ``model.json``; each file appears complete or not at all.
 
-    With a classifier of plausibility among the variables also ``plausibility.npz``.
+    What was fitted to the trained model goes to files of its own, see ``FITTED_FILES``.
 
     Leaves are stored as float16, or as float32 where the round trip through float16 loses more
     than 1e-3 relative (overflow, or values near zero such as the variances of batch norm): of any
@@ -78,28 +79,38 @@ def write_model(directory: str | Path, variables: PyTree, card: dict[str, Any]) 
     directory = Path(directory)
     arrays = {name: _compact(name, leaf) for name, leaf in flatten(variables).items()}
     text = _card_text(card)
-    fitted = {name: arrays.pop(name) for name in list(arrays) if name.startswith(_PLAUSIBILITY)}
     directory.mkdir(parents=True, exist_ok=True)
-    (directory / PLAUSIBILITY_FILE).unlink(missing_ok=True)  # never beside other weights
+    for file in FITTED_FILES.values():
+        (directory / file).unlink(missing_ok=True)  # never beside other weights
+    fitted = {
+        file: {path: arrays.pop(path) for path in list(arrays) if path.startswith(_prefix(name))}
+        for name, file in FITTED_FILES.items()
+    }
     write_atomically(directory / WEIGHTS_FILE, _packed(arrays))
-    if fitted:
-        write_atomically(directory / PLAUSIBILITY_FILE, _packed(fitted))
+    for file, own in fitted.items():
+        if own:
+            write_atomically(directory / file, _packed(own))
     write_atomically(directory / CARD_FILE, text)
 
 
-def write_plausibility(directory: str | Path, params: PyTree) -> None:
-    """Writes the classifier of plausibility of a model, in place of an older one.
+def write_fitted(directory: str | Path, name: str, params: PyTree) -> None:
+    """Writes what was fitted to a trained model, in place of an older one.
 
     Args:
       directory: of the model.
-      params: of ``plausibility.PlausibilityClassifier``.
+      name: a key of ``FITTED_FILES``.
+      params: of its module.
 
     Raises:
       CaperError: a weight is not finite or not a float.
     """
-    variables = {"params": {"plausibility": params}}
-    arrays = {name: _compact(name, leaf) for name, leaf in flatten(variables).items()}
-    write_atomically(Path(directory) / PLAUSIBILITY_FILE, _packed(arrays))
+    variables = {"params": {name: params}}
+    arrays = {path: _compact(path, leaf) for path, leaf in flatten(variables).items()}
+    write_atomically(Path(directory) / FITTED_FILES[name], _packed(arrays))
+
+
+def _prefix(name: str) -> str:
+    return f"params/{name}/"
 
 
 def _packed(arrays: dict[str, np.ndarray]) -> bytes:
@@ -139,9 +150,9 @@ def read_model(directory: str | Path) -> tuple[dict[str, Any], PyTree]:
     """
     card = read_card(directory)
     arrays = _unpacked(Path(directory) / WEIGHTS_FILE)
-    fitted = Path(directory) / PLAUSIBILITY_FILE
-    if fitted.is_file():
-        arrays |= _unpacked(fitted)
+    for file in FITTED_FILES.values():
+        if (Path(directory) / file).is_file():
+            arrays |= _unpacked(Path(directory) / file)
     return card, unflatten(arrays, str(directory))
 
 

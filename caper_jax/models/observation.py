@@ -1,4 +1,4 @@
-"""What the networks see of a cloud: without strays, turned to the viewing ray, in raster order."""
+"""What networks see of a cloud: no strays, turned to the viewing ray, level, in raster order."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Integer, Shaped
 
 from caper_jax.articulation.category import Category
-from caper_jax.geometry.frames import rotate, view_rotation
+from caper_jax.geometry.frames import level_rotation, multiply, rotate, view_rotation
 from caper_jax.geometry.outliers import Inliers, find_inliers
 from caper_jax.geometry.raster_order import from_raster_order, raster_order, to_raster_order
 
@@ -48,24 +48,44 @@ class ObservedCloud:
     Attributes:
       cloud: viewing frame, network units (meters times ``Category.unit``), raster order; without
         strays, in whose places others are repeated.
-      view: camera -> viewing frame, see ``geometry.frames.view_rotation``.
+      view: camera -> viewing frame, see ``viewing_frame``.
       selection: which of the points that came these are.
+      gravity: unit vector in the viewing frame, zeros where it is unknown; None without.
     """
 
     cloud: Float[Array, "B N 3"]
     view: Float[Array, "B 3 3"]
     selection: Selection
+    gravity: Float[Array, "B 3"] | None = None
 
 
-def observe(points: Float[Array, "B N 3"], category: Category) -> ObservedCloud:
+def observe(
+    points: Float[Array, "B N 3"], category: Category, gravity: Float[Array, "B 3"] | None = None
+) -> ObservedCloud:
     """Leaves out strays, and turns the ray to the mean of the others into the optical axis.
 
     Args:
       points: camera frame, meters, in any order.
       category: static.
+      gravity: unit vector in the camera frame; the cloud is leveled by it, whatever roll the
+        camera has. Zeros where it is unknown.
     """
-    roll = category.viewpoint.camera_roll
-    selection = select(rotate(view_rotation(points, roll), points))
+    selection = select(rotate(viewing_frame(points, category, gravity), points))
     kept = selection.pick(points)
-    view = view_rotation(kept, roll)
-    return ObservedCloud(rotate(view, kept) * category.unit, view, selection)
+    view = viewing_frame(kept, category, gravity)
+    seen = None if gravity is None else rotate(view, gravity[:, None])[:, 0]
+    return ObservedCloud(rotate(view, kept) * category.unit, view, selection, seen)
+
+
+def viewing_frame(
+    points: Float[Array, "B N 3"], category: Category, gravity: Float[Array, "B 3"] | None
+) -> Float[Array, "B 3 3"]:
+    """The rotation from the camera to the frame in which networks see a cloud.
+
+    The ray to the mean of the points becomes the optical axis (``geometry.frames.view_rotation``);
+    then gravity, where it is known, points down the image. Arguments as for ``observe``.
+    """
+    view = view_rotation(points, category.viewpoint.camera_roll)
+    if gravity is None:
+        return view
+    return multiply(level_rotation(rotate(view, gravity[:, None])[:, 0]), view)

@@ -24,7 +24,8 @@ from caper_jax.lie import se3
 from caper_jax.lie.linalg import transpose
 from caper_jax.models import uncertainty
 from caper_jax.models.encoders import shared_neighborhoods
-from caper_jax.models.parts import PartsNetwork, increment_transform, vote
+from caper_jax.models.gravity import class_log_weights
+from caper_jax.models.parts import PartsNetwork, PartsOutput, increment_transform, vote
 from caper_jax.models.refiner import BoxRefiner, StageEstimate, apply_residual, refiner_features
 from caper_jax.models.root import RootNetwork
 from caper_jax.models.rotation_classes import rotate_pose, select_rotation
@@ -43,11 +44,14 @@ class StageOutputs:
     Attributes:
       estimate: pose, joints and boxes.
       segmentation: logits.
+      rotation_class: logits of ``models.rotation_classes``, by which of them the estimate is still
+        off; None without that head.
       confidence, degenerate, evidence: see ``estimator.Prediction``.
     """
 
     estimate: StageEstimate
     segmentation: Float[Array, "B N K"]
+    rotation_class: Float[Array, "B 24"] | None
     confidence: Float[Array, "B 2"]
     degenerate: Bool[Array, "B"]
     evidence: Float[Array, "B K E"]
@@ -58,6 +62,7 @@ def run_stages(
     cloud: Float[Array, "B N 3"],
     category: Category,
     network: NetworkConfig,
+    gravity: Float[Array, "B 3"] | None = None,
 ) -> StageOutputs:
     """Both stages, without the refiner.
 
@@ -65,15 +70,12 @@ def run_stages(
       variables: see ``estimator.estimate``.
       cloud: viewing frame, network units, raster order (``observation.ObservedCloud.cloud``).
       category, network: static.
+      gravity: unit vector in the viewing frame, zeros where it is unknown.
     """
 
-    def apply(stage, module, cloud):
-        own = {name: collection[stage] for name, collection in variables.items()}
-        return module.apply(own, cloud, train=False, space=space)
-
-    unit = category.unit
     space = shared_neighborhoods(network, cloud)
-    root = apply("root", RootNetwork(network), cloud)
+    own = {name: collection["root"] for name, collection in variables.items()}
+    root: Any = RootNetwork(network).apply(own, cloud, train=False, space=space)
     rotation, degenerate = rotation_from_directions(
         root.directions[:, 0],
         root.directions[:, 1],
@@ -81,38 +83,59 @@ def run_stages(
         root.confidence[:, 1],
         category.directions,
     )
-    pose = se3.from_rt(rotation, root.translation)
-    parts_network = PartsNetwork(network, category.num_parts)
-    unrefined = pose
+    pose = unrefined = se3.from_rt(rotation, root.translation)
     for _ in range(network.refine_steps):
-        canonical = canonicalize(cloud, pose[:, :3, :3], pose[:, :3, 3])
-        output = apply("parts", parts_network, canonical)
+        _, output = see_parts(variables, cloud, pose, category, network, space)
         if output.rotation_class is not None:
-            pose = rotate_pose(
-                pose, select_rotation(output.rotation_class, network.rotation_classifier.margin)
-            )
+            logits = output.rotation_class
+            if gravity is not None:
+                logits += class_log_weights(pose[:, :3, :3], gravity, category)
+            pose = rotate_pose(pose, select_rotation(logits, network.rotation_classifier.margin))
         pose = se3.compose(pose, increment_transform(output.increment, network.increment))
-    canonical = canonicalize(cloud, pose[:, :3, :3], pose[:, :3, 3])
-    parts = apply("parts", parts_network, canonical)
-    axis, pivot = vote(canonical, parts.heatmap, parts.offset, parts.direction)
-    mean_size = jnp.asarray(category.mean_size, cloud.dtype) * unit
-    widest = jnp.asarray(np.abs(category.network_state_bounds).max(-1), cloud.dtype)
+    estimate, parts = see_parts(variables, cloud, pose, category, network, space)
     moved = se3.log(se3.compose(se3.inverse(unrefined), pose))
     return StageOutputs(
-        estimate=StageEstimate(
-            root=pose,
-            axis=axis,
-            pivot=pivot,
-            state=jnp.clip(parts.state, -_ABSURD * widest, _ABSURD * widest),
-            size=jnp.clip(mean_size + parts.size, SMALLEST_SIZE * mean_size, _ABSURD * mean_size),
-            center=jnp.asarray(category.mean_center, cloud.dtype) * unit
-            + jnp.clip(parts.center, -_ABSURD * mean_size, _ABSURD * mean_size),
-        ),
+        estimate=estimate,
         segmentation=parts.segmentation,
+        rotation_class=parts.rotation_class,
         confidence=root.confidence,
         degenerate=degenerate,
         evidence=uncertainty.evidence(root.confidence, moved, parts.segmentation),
     )
+
+
+def see_parts(
+    variables: dict[str, Any],
+    cloud: Float[Array, "B N 3"],
+    pose: Float[Array, "B 4 4"],
+    category: Category,
+    network: NetworkConfig,
+    space: Any,
+) -> tuple[StageEstimate, PartsOutput]:
+    """Stage II of clouds whose roots are in given poses: the whole estimate, and all it says.
+
+    Args:
+      variables, cloud, category, network: see ``run_stages``.
+      pose: of the roots, viewing frame, network units.
+      space: of ``shared_neighborhoods`` for the cloud.
+    """
+    own = {name: collection["parts"] for name, collection in variables.items()}
+    canonical = canonicalize(cloud, pose[:, :3, :3], pose[:, :3, 3])
+    module = PartsNetwork(network, category.num_parts)
+    parts: Any = module.apply(own, canonical, train=False, space=space)
+    axis, pivot = vote(canonical, parts.heatmap, parts.offset, parts.direction)
+    mean_size = jnp.asarray(category.mean_size, cloud.dtype) * category.unit
+    mean_center = jnp.asarray(category.mean_center, cloud.dtype) * category.unit
+    widest = jnp.asarray(np.abs(category.network_state_bounds).max(-1), cloud.dtype)
+    estimate = StageEstimate(
+        root=pose,
+        axis=axis,
+        pivot=pivot,
+        state=jnp.clip(parts.state, -_ABSURD * widest, _ABSURD * widest),
+        size=jnp.clip(mean_size + parts.size, SMALLEST_SIZE * mean_size, _ABSURD * mean_size),
+        center=mean_center + jnp.clip(parts.center, -_ABSURD * mean_size, _ABSURD * mean_size),
+    )
+    return estimate, parts
 
 
 def refinements(

@@ -26,7 +26,7 @@ from caper_jax.data.clouds import MIN_POINTS, systematic_indices
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load
 from caper_jax.geometry.boxes import rest_diagonal
-from caper_jax.models.files import write_card, write_plausibility
+from caper_jax.models.files import write_card, write_fitted
 from caper_jax.models.observation import observe
 from caper_jax.models.pipeline import refinements, run_stages
 from caper_jax.models.plausibility import (
@@ -147,7 +147,7 @@ def add_plausibility(
     check_frame_count(frames)
     estimator = load(category, directory, calibrated=False)
     fitted = fit_plausibility(estimator, config, frames, seed)
-    write_plausibility(directory, fitted)
+    write_fitted(directory, "plausibility", fitted)
     origin = {"frames": frames, "seed": seed, "false_alarms": FALSE_ALARMS}
     write_card(directory, {**estimator.card, "plausibility": origin})
 

@@ -23,7 +23,7 @@ from caper_jax.errors import CaperError
 from caper_jax.estimator import load
 from caper_jax.lie import se3, so3
 from caper_jax.models import plausibility
-from caper_jax.models.files import PLAUSIBILITY_FILE, read_model, write_model
+from caper_jax.models.files import FITTED_FILES, read_model, write_model
 from caper_jax.models.observation import observe
 from caper_jax.models.plausibility import (
     FEW_POINTS,
@@ -243,10 +243,10 @@ class TestFit:
     def test_weights_written_again_leave_the_old_classifier_behind(self, folder, tmp_path):
         card, variables = read_model(folder)
         write_model(tmp_path / "other", variables, card)
-        assert (tmp_path / "other" / PLAUSIBILITY_FILE).is_file()
+        assert (tmp_path / "other" / FITTED_FILES["plausibility"]).is_file()
         del variables["params"]["plausibility"]
         write_model(tmp_path / "other", variables, card)
-        assert not (tmp_path / "other" / PLAUSIBILITY_FILE).exists()
+        assert not (tmp_path / "other" / FITTED_FILES["plausibility"]).exists()
         assert (
             load("box", tmp_path / "other")(
                 np.zeros((64, 3)) + np.arange(64)[:, None] * 0.01 + 0.5
@@ -256,7 +256,7 @@ class TestFit:
 
     def test_a_damaged_classifier_is_named(self, folder, tmp_path):
         write_model(tmp_path / "box", *reversed(read_model(folder)))
-        (tmp_path / "box" / PLAUSIBILITY_FILE).write_bytes(b"no")
+        (tmp_path / "box" / FITTED_FILES["plausibility"]).write_bytes(b"no")
         with pytest.raises(CaperError, match=r"plausibility\.npz is damaged"):
             load("box", tmp_path / "box")
 

@@ -176,6 +176,7 @@ EYEGLASSES = Category(
         Joint("revolute", parent=0, limits=(0.0, _FOLDED)),
     ),
     directions=("y", "z"),
+    stands=False,
     directions_reason="mirror-symmetric in the y-z plane, so y and z are what the shape shows",
     unit=10.0,
     mean_size=((0.134, 0.044, 0.017), (0.009, 0.029, 0.126), (0.009, 0.029, 0.126)),
