@@ -69,6 +69,8 @@ class Prediction:
         radians and meters; the truth lies within 2.5 of them nine times in ten. None, as is the
         next, where the model is not calibrated. See ``uncertainty.pose_covariance``.
       state_std: radians or meters; the truth lies within 1.64 of them nine times in ten.
+      size_std: meters, along each axis of the part; the true extent lies within 1.64 of it nine
+        times in ten. None where the calibration is older than this.
       hypotheses: the readings of the cloud that are likeliest, H of them, with probabilities; the
         first is ``pose``. None where the model was not fitted to tell.
     """
@@ -88,6 +90,7 @@ class Prediction:
     rotation_std: Float[Array, "*batch K"] = None
     translation_std: Float[Array, "*batch K"] = None
     state_std: Float[Array, "*batch J"] = None
+    size_std: Float[Array, "*batch K 3"] = None
     hypotheses: Hypotheses | None = None
 
     def joints_in_camera(
@@ -174,9 +177,12 @@ def estimate(
     if calibration is None:
         return prediction
     rotation, translation, state = uncertainty.radii(calibration, prediction.evidence)
+    seen = uncertainty.foreshortening(prediction.pose.rotation, prediction.pose.translation)
+    size = uncertainty.size_radii(calibration, prediction.evidence, seen)
     if verdict.score is not None:
         wider = widening(verdict.score)[:, None]
         rotation, translation = jnp.minimum(rotation * wider, np.pi), translation * wider
+        size = None if size is None else size * wider[..., None]
         low, high = category.network_state_bounds.T.astype(state.dtype)
         state = jnp.minimum(state * wider, high - low)
     state_units = jnp.asarray(category.state_units, state.dtype)
@@ -184,6 +190,7 @@ def estimate(
         rotation_std=rotation / uncertainty.RADIUS_3D,
         translation_std=translation / uncertainty.RADIUS_3D / category.unit,
         state_std=state / uncertainty.RADIUS_1D / state_units,
+        size_std=None if size is None else size / uncertainty.RADIUS_1D / category.unit,
     )
 
 
@@ -352,7 +359,7 @@ def load(
     object_scale: float = 1.0,
     camera_roll: float = 0.0,
     calibrated: bool = True,
-    hypotheses: int = 1,
+    hypotheses: int | None = 1,
 ) -> Estimator:
     """The estimator of a category.
 
@@ -367,7 +374,8 @@ def load(
         for a camera upside down; the shipped models know level cameras, within 15 deg.
       calibrated: whether to read the calibration in the card; without it, or where there is none,
         there are no standard deviations.
-      hypotheses: how many readings of a cloud to state, at most 4; see ``Prediction.hypotheses``.
+      hypotheses: how many readings of a cloud to state, at most 4, see ``Prediction.hypotheses``;
+        None for as many as the model can state.
 
     Raises:
       CaperError: unknown category, no model of it in the package, a damaged model, or one of
@@ -395,6 +403,8 @@ def load(
     network = network_of(card, directory)
     _check_variables(directory, variables, definition, network)
     definition = definition.scaled(object_scale).rolled(camera_roll)
+    if hypotheses is None:
+        hypotheses = MOST if "hypotheses" in variables["params"] else 1
     return Estimator(definition, network, variables, card, hypotheses)
 
 

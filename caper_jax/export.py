@@ -83,6 +83,8 @@ _OUTPUTS = {
     "points_per_part": ("1", _NONE, "[B, K] how many of the points show each part"),
     "rotation_std": ("radians", _CAMERA, "[B, K] standard deviation about each axis"),
     "translation_std": ("meters", _CAMERA, "[B, K] standard deviation along each axis"),
+    "size_std": ("meters", _PART, "[B, K, 3] standard deviation of each extent"),
+    "probability": ("1", _NONE, "[B] that all rotations are right within 30 degrees"),
     "state_std": ("state", _NONE, "[B, J] standard deviation"),
 }
 _CARD = (
@@ -103,6 +105,8 @@ def flat(prediction: Prediction) -> dict[str, Any]:
     """
     axis, pivot = joints_in_camera(prediction.pose)
     arrays = {**vars(prediction.pose), **vars(prediction)}
+    stated = prediction.hypotheses
+    arrays["probability"] = None if stated is None else stated.probability[..., 0]
     arrays |= {"joint_axis_camera": axis, "joint_pivot_camera": pivot}
     return {name: arrays[name] for name in _OUTPUTS if arrays[name] is not None}
 

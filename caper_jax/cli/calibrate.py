@@ -1,4 +1,4 @@
-"""``caper calibrate``: fits the standard deviations of a model on generated frames."""
+"""``caper calibrate``: fits what a model says of its own estimates on generated frames."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ EXAMPLES = (
 class Calibrate:
     """Fits what a model says about its own errors, and whether an estimate is plausible at all.
 
-    Standard deviations (rotation_std, translation_std, state_std) and the classifier that tells
-    right objects from wrong ones are fitted on generated frames of instances that training never
-    shows. With --refiner the network that corrects the model's estimates by the sides of their
-    boxes is fitted first. Training on generated frames does both at its end.
+    Standard deviations (rotation_std, translation_std, size_std, state_std), the probabilities of
+    readings (hypotheses) and the classifier that tells right objects from wrong ones are fitted on
+    generated frames. With --refiner the network that corrects the model's estimates by the sides of
+    their boxes is fitted first. Training on generated frames does both at its end.
 
     Attributes:
       category: e.g. box, or FILE.py:NAME for one of your own
-      weights: model directory; its model.json and plausibility.npz are rewritten
-      frames: to calibrate on; three times as many for the classifier
+      weights: model directory; its model.json, plausibility.npz and hypotheses.npz are rewritten
+      frames: to calibrate on; three times as many for the classifier, 1.5 for the readings
       refiner: fit the refiner first
       refiner_frames: to fit the refiner on
       seed: of shapes and frames
@@ -54,7 +54,7 @@ def run(options: Calibrate) -> int:
     from caper_jax.config import TRAINING_DATA
     from caper_jax.models.files import CARD_FILE
     from caper_jax.training import fit_refiner
-    from caper_jax.training.fit_plausibility import add_calibration
+    from caper_jax.training.calibration import add_calibration
     from caper_jax.training.fit_uncertainty import check_frame_count
 
     weights, category = options.weights, options.category

@@ -295,6 +295,21 @@ def pixel_box(text: str) -> tuple[float, float, float, float]:
     return x1, y1, x2, y2
 
 
+def direction(text: str, argument: str) -> tuple[float, float, float]:
+    """x,y,z of a direction, of any length.
+
+    Raises:
+      CaperError: something else, or no direction.
+    """
+    try:
+        x, y, z = (float(value) for value in text.split(","))
+    except ValueError:
+        raise CaperError(f"{argument}: {text!r} is not x,y,z") from None
+    if not 1e-6 < x * x + y * y + z * z < float("inf"):
+        raise CaperError(f"{argument}: {text!r} is no direction")
+    return x, y, z
+
+
 def check_folder(folder: Path, argument: str) -> None:
     """Refuses, before any work, a folder that cannot be made or written in.
 

@@ -98,6 +98,7 @@ def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
     """Estimates the frames one by one, as a live camera would, and prints what it finds."""
     from caper_jax.data.clouds import cloud_from_depth
     from caper_jax.data.images import read_depth, read_intrinsics, read_mask
+    from caper_jax.data.types import Frame
     from caper_jax.estimator import load
     from caper_jax.progress import progress
     from caper_jax.visualization.scene import Scene, format_scene
@@ -107,7 +108,7 @@ def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
     seconds: list[float] = []
     calls = 1 + TIMED_CALLS * len(folders)
     with progress(f"{category.name}: loading, compiling, estimating", total=calls) as bar:
-        estimator = load(category.name)
+        estimator = load(category.name, hypotheses=None)
         for folder in folders:
             depth, mask = read_depth(folder / "depth.png"), read_mask(folder / "mask.png")
             intrinsics = read_intrinsics(folder / "intrinsics.json", depth.shape)
@@ -121,8 +122,8 @@ def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
                 bar.update(1)
             truth = _read_truth(folder / "truth.json", category)
             name = folder.name.replace("_", " ")
-            shown = prediction.points, prediction.labels, prediction.pose, truth
-            scenes.append(Scene(name, category, *shown, depth, mask, intrinsics))
+            frame = Frame(name, points, truth=truth, depth=depth, mask=mask, intrinsics=intrinsics)
+            scenes.append(Scene.of_prediction(frame, category, prediction))
     for scene in scenes:
         print(f"\n{scene.name}\n{format_scene(scene)}")
     print(

@@ -50,6 +50,8 @@ class Estimate:
       object_scale: the objects are so many times as large as those the model was trained on
       camera_roll: degrees by which the image shows things turned clockwise, 180 for upside down
         (models know level cameras, within 15)
+      gravity: x,y,z of the way things fall, in the camera's frame (x right, y down, z forward), of
+        any length; instead of --camera-roll, and better: what stands is then not read as lying
     """
 
     category: str
@@ -65,12 +67,15 @@ class Estimate:
     weights: Path | None = None
     object_scale: Positive = 1.0
     camera_roll: float = 0.0
+    gravity: str | None = None
 
 
 def parse(argv: Sequence[str]) -> Estimate:
     options = common.parse(Estimate, argv, EXAMPLES)
     _check_inputs(options)
     _check_outputs(options)
+    if options.gravity is not None:
+        common.direction(options.gravity, "--gravity")
     return options
 
 
@@ -83,18 +88,22 @@ def run(options: Estimate) -> int:
     from caper_jax.estimator import load
     from caper_jax.evaluation.records import estimate_record
     from caper_jax.files import write_atomically
-    from caper_jax.models import plausibility
+    from caper_jax.models import hypotheses, plausibility
     from caper_jax.visualization.scene import Scene, format_scene
 
     category = categories.get(options.category)
     cloud, frame = _observe(options)
-    estimator = load(category.name, options.weights, options.object_scale, options.camera_roll)
-    prediction = estimator(cloud.points[None])
+    estimator = load(
+        category.name, options.weights, options.object_scale, options.camera_roll, hypotheses=None
+    )
+    gravity = None
+    if options.gravity is not None:
+        gravity = common.direction(options.gravity, "--gravity")
+    prediction = estimator(cloud.points[None], gravity)
     prediction = jax.tree.map(lambda array: np.asarray(array)[0], prediction)
     record = estimate_record(frame.name, prediction, category, cloud)
-    shown = prediction.points, prediction.labels, prediction.pose
     doubt = plausibility.implausible_because(prediction, category)
-    scene = Scene.of_frame(frame, category, *shown, warning=doubt)
+    scene = Scene.of_prediction(frame, category, prediction)
 
     if doubt:
         print(f"warning: {doubt}", file=sys.stderr)
@@ -103,6 +112,8 @@ def run(options: Estimate) -> int:
     strays = int((prediction.labels < 0).sum())
     if strays:
         print(f"{strays} of {len(prediction.labels)} points looked at lie alone, and were left out")
+    for line in hypotheses.in_words(prediction, category):
+        print(line)
     print(_certainty(prediction, category), end="")
     if prediction.degenerate:
         print("the rotation is arbitrary: the two directions that give it are parallel")
@@ -196,7 +207,11 @@ def _certainty(prediction: Prediction, category: Category) -> str:
         for k, name in enumerate(category.parts):
             rotation = np.degrees(prediction.rotation_std[k])
             translation = 1000 * prediction.translation_std[k]
-            lines.append(f"{name}: standard deviation {rotation:.1f} deg, {translation:.0f} mm")
+            line = f"{name}: standard deviation {rotation:.1f} deg, {translation:.0f} mm"
+            if prediction.size_std is not None:
+                size = " x ".join(f"{1000 * extent:.0f}" for extent in prediction.size_std[k])
+                line += f", of its size {size} mm"
+            lines.append(line)
         for j, kind in enumerate(category.joint_types):
             state = format_state(float(prediction.state_std[j]), kind)
             lines.append(f"{joint_name(category, j)}: standard deviation {state}")

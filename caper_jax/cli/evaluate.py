@@ -53,6 +53,9 @@ class Evaluate:
       object_scale: the objects are so many times as large as those the model was trained on, e.g.
         3.7 for the laptops of PM-Videos and ArtImage (PartNet units read as meters)
       camera_roll: degrees by which the images show things turned clockwise, 180 for upside down
+      use_gravity: tell the model which way things fall, where the data know it
+      hypotheses: readings of each frame that the model states, at most 4 (default: as many as it
+        can); metrics.json says how often one of them is right
     """
 
     category: str
@@ -70,6 +73,8 @@ class Evaluate:
     worst: Count | None = None
     object_scale: Positive = 1.0
     camera_roll: float = 0.0
+    use_gravity: bool = False
+    hypotheses: Count | None = None
 
 
 def parse(argv: Sequence[str]) -> Evaluate:
@@ -97,7 +102,9 @@ def run(options: Evaluate) -> int:
     estimator = weights = None
     if options.predictor != "truth":
         estimator, predictor, weights = _predictor(options, category)
-    evaluation = protocol.evaluate(dataset, predictor, options.frames)
+    evaluation = protocol.evaluate(
+        dataset, predictor, options.frames, use_gravity=options.use_gravity
+    )
     result = report.summarize(evaluation, dataset, options.predictor, weights)
     options.out.mkdir(parents=True, exist_ok=True)
     report.write_report(options.out, evaluation, result)
@@ -145,7 +152,13 @@ def _predictor(
     from caper_jax.estimator import load
     from caper_jax.evaluation import protocol
 
-    estimator = load(category.name, options.weights, options.object_scale, options.camera_roll)
+    estimator = load(
+        category.name,
+        options.weights,
+        options.object_scale,
+        options.camera_roll,
+        hypotheses=options.hypotheses,
+    )
     weights = str(options.weights or f"shipped with the package ({category.name})")
     if options.predictor == "model":
         if options.camera_roll:
@@ -169,7 +182,6 @@ def _write_worst(
 
     from caper_jax.evaluation.loading import cloud_of
     from caper_jax.lie import so3
-    from caper_jax.models import plausibility
     from caper_jax.visualization.picture import write_picture
     from caper_jax.visualization.scene import Scene
 
@@ -186,7 +198,5 @@ def _write_worst(
         frame = dataset[index]
         print(f"  {off[index]:6.1f} deg  {frame.name}")
         prediction = estimator(cloud_of(frame, estimator.network.num_points))
-        shown = prediction.points, prediction.labels, prediction.pose
-        doubt = plausibility.implausible_because(prediction, dataset.category)
-        scenes.append(Scene.of_frame(frame, dataset.category, *shown, warning=doubt))
+        scenes.append(Scene.of_prediction(frame, dataset.category, prediction))
     write_picture(path, scenes)

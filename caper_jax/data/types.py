@@ -50,6 +50,7 @@ class Frame:
       intrinsics: [3, 3] pixels, of ``depth``.
       instance: which object is shown, by its name in the dataset (urdf_id, PartNet id, number of
         a generated shape); None when unknown.
+      gravity: [3] unit vector, the way things fall; None when unknown.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Frame:
     mask: Bool[np.ndarray, "H W"] | None = None
     intrinsics: Float64[np.ndarray, "3 3"] | None = None
     instance: str | None = None
+    gravity: Float[np.ndarray, " 3"] | None = None
 
 
 @flax.struct.dataclass

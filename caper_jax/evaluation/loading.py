@@ -34,6 +34,7 @@ class FrameBatch:
       points: what a predictor sees, meters, camera frame.
       truth: arrays [B, K, ...], checked.
       shown: whether the frame shows enough to estimate anything.
+      gravity: unit vectors, zeros where the data do not know it.
     """
 
     frames: Sequence[Frame]
@@ -41,6 +42,7 @@ class FrameBatch:
     points: Float32[np.ndarray, "B N 3"]
     truth: ArticulatedPose
     shown: Bool[np.ndarray, " B"]
+    gravity: Float32[np.ndarray, "B 3"]
 
 
 def frame_batches(
@@ -97,12 +99,14 @@ def _read(dataset: Dataset, start: int, count: int, batch_size: int, num_points:
         for frame, one in zip(frames, truths, strict=True):
             if problems := pose_problems(one, dataset.category):
                 raise CaperError(f"ground truth of frame {frame.name!r}: {'; '.join(problems)}")
+    known = [np.zeros(3) if frame.gravity is None else frame.gravity for frame in frames]
     return FrameBatch(
         frames=[*frames, *[frames[-1]] * padding],
         count=count,
         points=np.stack([*clouds, *[clouds[-1]] * padding]),
         truth=truth,
         shown=np.array([*shown, *[shown[-1]] * padding]),
+        gravity=np.asarray([*known, *[known[-1]] * padding], np.float32),
     )
 
 

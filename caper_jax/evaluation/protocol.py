@@ -45,6 +45,19 @@ Predictor = Callable[[Sequence[Frame], np.ndarray], ArticulatedPose | Prediction
 
 
 @flax.struct.dataclass
+class Readings:
+    """What an estimator says a frame may show, the answer first; see ``models.hypotheses``.
+
+    Attributes:
+      probability: that each of H readings is right.
+      rotation_deg: errors of their parts, up to the category's declared symmetries.
+    """
+
+    probability: Float[Array, "F H"]
+    rotation_deg: Float[Array, "F H K"]
+
+
+@flax.struct.dataclass
 class Estimates:
     """Estimates of F frames and their errors; numpy arrays, or JAX's within a program.
 
@@ -55,6 +68,7 @@ class Estimates:
         says nothing.
       errors: against the truth; ``metrics.FAILURE_VALUES`` where ``failed``.
       symmetric_errors: the same up to the category's declared symmetries; None where it has none.
+      readings: of the estimator; None where it states no probabilities.
     """
 
     pose: ArticulatedPose
@@ -62,6 +76,7 @@ class Estimates:
     plausible: Bool[Array, " F"] | None
     errors: PoseErrors
     symmetric_errors: PoseErrors | None
+    readings: Readings | None = None
 
 
 @dataclass(frozen=True)
@@ -72,7 +87,7 @@ class Evaluation:
       names: F names.
       estimate: arrays [F, K, ...]; NaN where ``failed``.
       truth: arrays [F, K, ...].
-      failed, plausible, errors, symmetric_errors: see ``Estimates``.
+      failed, plausible, errors, symmetric_errors, readings: see ``Estimates``.
       visibility: [F, K] share of each part that nothing hides; NaN where the data do not say.
       seconds_per_frame: time of the predictor, after a first call that compiles; of an
         ``Estimator``, the errors' included.
@@ -87,6 +102,7 @@ class Evaluation:
     symmetric_errors: PoseErrors | None
     visibility: Float[np.ndarray, "frames parts"]
     seconds_per_frame: float
+    readings: Readings | None = None
 
 
 def evaluate(
@@ -97,6 +113,7 @@ def evaluate(
     num_points: int | None = None,
     seed: int = 0,
     devices: Sequence[jax.Device] | None = None,
+    use_gravity: bool = False,
 ) -> Evaluation:
     """Estimates frames and measures the errors, in batches of one shape.
 
@@ -115,6 +132,7 @@ def evaluate(
         many as its networks take.
       seed: of a generator's frames, which are those that ``caper generate`` writes for it.
       devices: that an ``Estimator`` runs on; all of this process by default.
+      use_gravity: whether an ``Estimator`` is told which way things fall, where the data know it.
 
     Raises:
       CaperError: no frames, frames without (or with broken) ground truth, or of another category
@@ -134,7 +152,7 @@ def evaluate(
         mesh = data_mesh(jax.local_devices() if devices is None else devices)
         batch_size = -(-batch_size // mesh.size) * mesh.size
         num_points = estimator.network.num_points
-        step: Any = _EstimatorStep(estimator, category, mesh)
+        step: Any = _EstimatorStep(estimator, category, mesh, use_gravity)
     else:
         step = _PredictorStep(estimator, category)
     # Where there are more batches to time, none is estimated twice.
@@ -173,6 +191,7 @@ def evaluate(
         symmetric_errors=whole.symmetric_errors,
         visibility=np.stack(visibility),
         seconds_per_frame=sum(seconds) / (len(seconds) * batch_size),
+        readings=whole.readings,
     )
 
 
@@ -187,22 +206,26 @@ def _frames_of(data: Dataset | Generator, frames: int | None, seed: int) -> Data
 class _EstimatorStep:
     """Estimates and errors as one program, each device on its own rows."""
 
-    def __init__(self, estimator: Estimator, category: Category, mesh: Mesh) -> None:
+    def __init__(
+        self, estimator: Estimator, category: Category, mesh: Mesh, use_gravity: bool
+    ) -> None:
+        self._use_gravity = use_gravity
         self._variables = jax.device_put(estimator.variables, replicated(mesh))
         self._rows = batch_sharding(mesh)
         self._static = {"function": estimator.function, "category": category, "mesh": mesh}
 
     def predict(self, batch: FrameBatch) -> Estimates:
         truth = jax.tree.map(np.float32, batch.truth)
-        arrays = jax.device_put((batch.points, truth, batch.shown), self._rows)
+        gravity = batch.gravity if self._use_gravity else None
+        arrays = jax.device_put((batch.points, gravity, truth, batch.shown), self._rows)
         return _estimated(self._variables, *arrays, **self._static)
 
     def finish(self, batch: FrameBatch, found: Estimates) -> Estimates:
         return jax.device_get(found)
 
 
-def _estimated_rows(variables, points, truth, shown, function, category) -> Estimates:
-    prediction = function(variables, points)
+def _estimated_rows(variables, points, gravity, truth, shown, function, category) -> Estimates:
+    prediction = function(variables, points, gravity=gravity)
     failed = ~(shown & is_finite(prediction.pose))
     arguments = prediction.pose, truth, category, failed
     symmetric = unchecked_errors_up_to_symmetry(*arguments) if category.symmetries else None
@@ -212,23 +235,36 @@ def _estimated_rows(variables, points, truth, shown, function, category) -> Esti
         plausible=prediction.plausible & ~failed,
         errors=unchecked_pose_errors(*arguments),
         symmetric_errors=symmetric,
+        readings=_readings(prediction, truth, category, failed),
     )
 
 
+def _readings(prediction: Prediction, truth, category: Category, failed) -> Readings | None:
+    stated = prediction.hypotheses
+    if stated is None:
+        return None
+
+    def error(pose: ArticulatedPose) -> Any:
+        return unchecked_errors_up_to_symmetry(pose, truth, category, failed).rotation_deg
+
+    off = jax.vmap(error, in_axes=1, out_axes=1)(stated.pose)
+    return Readings(jnp.where(failed[:, None], 0.0, stated.probability), off)
+
+
 @partial(jax.jit, static_argnames=("function", "category", "mesh"))
-def _estimated(variables, points, truth, shown, function, category, mesh) -> Estimates:
+def _estimated(variables, points, gravity, truth, shown, function, category, mesh) -> Estimates:
     rows = partial(_estimated_rows, function=function, category=category)
     if mesh.size == 1:
-        return rows(variables, points, truth, shown)
+        return rows(variables, points, gravity, truth, shown)
     everywhere, split = PartitionSpec(), PartitionSpec(DATA_AXIS)
     # Frames do not see one another, so nothing crosses between devices.
     return jax.shard_map(
         rows,
         mesh=mesh,
-        in_specs=(everywhere, split, split, split),
+        in_specs=(everywhere, split, split, split, split),
         out_specs=split,
         check_vma=False,
-    )(variables, points, truth, shown)
+    )(variables, points, gravity, truth, shown)
 
 
 class _PredictorStep:

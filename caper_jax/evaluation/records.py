@@ -15,6 +15,7 @@ A record is one object of one frame and complete in itself:
     box_center [3]: the box's center, in the part's rest frame.
     rotation_std_deg [], translation_std []: standard deviation about and along each axis; absent
       where the model is not calibrated, and in tracks.
+    size_std [3]: standard deviations of the size; absent likewise.
     points: points of the cloud that the part has; hidden: too few, so that it is known through its
       joint alone. Both absent in tracks.
   joints: a list, each with
@@ -31,7 +32,9 @@ A record is one object of one frame and complete in itself:
     distinct_points: how many different points the object has.
 
 ``estimate`` adds confidence (of the root's two directions, 0 to 1), plausibility (0 to 1, absent
-where the model has no classifier) and points (of the cloud: available, dropped). ``track`` adds
+where the model has no classifier), points (of the cloud: available, dropped) and hypotheses (absent
+where the model was not fitted to state them): a list of readings, the answer first, each with its
+probability, and parts and joints as above, without deviations. ``track`` adds
 energy, keyframe, estimated, lost and milliseconds; the live stream also skipped, the frames left
 out before this one.
 """
@@ -41,6 +44,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 
 from caper_jax.articulation.category import Category
@@ -152,15 +156,31 @@ def estimate_record(
         if prediction.rotation_std is not None:
             part["rotation_std_deg"] = float(np.degrees(prediction.rotation_std[k]))
             part["translation_std"] = float(prediction.translation_std[k])
+        if prediction.size_std is not None:
+            part["size_std"] = _rounded(np.asarray(prediction.size_std[k], np.float64))
     if prediction.state_std is not None:
         for j, joint in enumerate(record["joints"]):
             joint["state_std"] = float(prediction.state_std[j]) * _per_unit(category, j)
     record |= _verdict(prediction, category)
     if prediction.plausibility is not None:
         record["plausibility"] = round(float(prediction.plausibility), 6)
+    if prediction.hypotheses is not None:
+        stated = prediction.hypotheses
+        record["hypotheses"] = [
+            {
+                "probability": round(float(chance), 6),
+                **_reading(name, jax.tree.map(lambda leaf, i=i: leaf[i], stated.pose), category),
+            }
+            for i, chance in enumerate(np.asarray(stated.probability))
+        ]
     record["confidence"] = prediction.confidence.tolist()
     record["points"] = {"available": cloud.available, "dropped": cloud.dropped}
     return record
+
+
+def _reading(name: str, pose: ArticulatedPose, category: Category) -> dict[str, Any]:
+    whole = pose_record(name, pose, category)
+    return {key: whole[key] for key in ("parts", "joints")}
 
 
 def frame_record(

@@ -21,7 +21,7 @@ from caper_jax.evaluation.metrics import (
     PART_METRICS,
     PoseErrors,
 )
-from caper_jax.evaluation.protocol import Evaluation
+from caper_jax.evaluation.protocol import Evaluation, Readings
 from caper_jax.files import write_atomically
 
 METRICS_FILE = "metrics.json"
@@ -29,6 +29,7 @@ PREDICTIONS_FILE = "predictions.npz"
 # Beyond this a rotation is taken to be flipped (another face taken for the front), not inaccurate.
 FLIPPED_DEG = 30.0
 STATE_UNITS = {"revolute": "degrees", "prismatic": "meters"}
+CONFIDENT = 0.9  # probability beyond which an answer counts as stated with confidence
 # Bins of paper Table 8: the share of a part that is occluded, low to high. (The paper defines its
 # level as the visible share, yet calls 80-100 % highly occluded and reports it as the worst.)
 _OCCLUSION = ((0.0, 0.4), (0.4, 0.8), (0.8, 1.0))
@@ -76,6 +77,8 @@ def summarize(
         report["implausible"] = float(1.0 - evaluation.plausible.mean())
         if evaluation.plausible.any():
             report["plausible_only"] = error_tables(_of(errors, evaluation.plausible), category)
+    if evaluation.readings is not None:
+        report["readings"] = reading_summary(evaluation.readings, category)
     if category.closed:
         state = np.asarray(evaluation.truth.joint_state)
         report["by_opening"] = errors_by_opening(errors, state, category)
@@ -108,6 +111,45 @@ def error_tables(errors: PoseErrors, category: Category) -> dict[str, list[dict[
         for j, kind in enumerate(category.joint_types)
     ]
     return {"parts": parts, "joints": joints}
+
+
+def reading_summary(readings: Readings, category: Category) -> dict[str, Any]:
+    """How often probabilities of readings keep their word, JSON-ready.
+
+    A reading is right where every part's rotation is within 30 deg of the truth, up to declared
+    symmetry. "right" is the share of frames whose answer is, "among_readings" those of which any
+    reading is; "confident" those whose answer has more than 90 %, "confident_and_wrong" those of
+    them that are wrong all the same, as a share of all frames. "calibration_error" is the expected
+    one: the mean difference of probability and share of right answers within tenths.
+    "best_reading_deg" are errors of the reading that is nearest to the truth.
+    """
+    probability = np.asarray(readings.probability, np.float64)
+    first, worst = probability[:, 0], np.asarray(readings.rotation_deg).max(-1)
+    is_right = worst <= FLIPPED_DEG
+    confident = first > CONFIDENT
+    nearest = np.take_along_axis(
+        np.asarray(readings.rotation_deg), worst.argmin(1)[:, None, None], axis=1
+    )[:, 0]
+    tenths = np.minimum((10 * first).astype(int), 9)
+    bins = []
+    for tenth in range(10):
+        within = tenths == tenth
+        if within.any():
+            stated, found = float(first[within].mean()), float(is_right[within, 0].mean())
+            bins.append({"frames": int(within.sum()), "stated": stated, "right": found})
+    error = sum(entry["frames"] * abs(entry["stated"] - entry["right"]) for entry in bins)
+    return {
+        "number": probability.shape[1],
+        "right": float(is_right[:, 0].mean()),
+        "among_readings": float(is_right.any(1).mean()),
+        "confident": float(confident.mean()),
+        "confident_and_wrong": float((confident & ~is_right[:, 0]).mean()),
+        "calibration_error": error / len(first),
+        "calibration": bins,
+        "best_reading_deg": [
+            {"name": name, **summary(nearest[:, k])} for k, name in enumerate(category.parts)
+        ],
+    }
 
 
 def _of(errors: PoseErrors, frames: np.ndarray) -> PoseErrors:
@@ -239,6 +281,8 @@ def format_report(report: dict[str, Any]) -> str:
     ]
     if "implausible" in report:
         lines += ["", *_format_plausible(report)]
+    if "readings" in report:
+        lines += ["", *_format_readings(report["readings"])]
     if "by_opening" in report:
         lines += ["", "by how far the most open joint is open, of its limits:"]
         lines += _format_bins(report["by_opening"], "opened")
@@ -267,6 +311,28 @@ def _format_plausible(report: dict[str, Any]) -> list[str]:
         rows.append([part["name"], *errors])
     header = ["part", "rotation [deg]", "without", "translation [mm]", "without"]
     return [f"{share}; errors with and without them:", *text_table(header, rows)]
+
+
+def _format_readings(readings: dict[str, Any]) -> list[str]:
+    """What probabilities are worth, in lines of at most 80 columns."""
+    text = (
+        f"answers right within {FLIPPED_DEG:.0f} deg: {100 * readings['right']:.1f} %; stated with "
+        f"over {100 * CONFIDENT:.0f} %: {100 * readings['confident']:.1f} %; wrong all the same: "
+        f"{100 * readings['confident_and_wrong']:.2f} % of all frames; calibration error "
+        f"{readings['calibration_error']:.3f}"
+    )
+    lines = textwrap.wrap(text, 80)
+    if readings["number"] > 1:
+        errors = ", ".join(
+            f"{part['name']} {format_error(part, 1, 2)} deg"
+            for part in readings["best_reading_deg"]
+        )
+        text = (
+            f"right one among {readings['number']} readings: "
+            f"{100 * readings['among_readings']:.1f} %; rotation of the nearest reading: {errors}"
+        )
+        lines += textwrap.wrap(text, 80)
+    return lines
 
 
 def format_tables(tables: dict[str, Any]) -> list[str]:

@@ -9,7 +9,7 @@ and one for "none of these", give their probabilities. ``training.fit_hypotheses
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import flax.linen as nn
 import flax.struct
@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import Array as AnyArray
@@ -101,7 +102,9 @@ class ReadingScorer(Weights, nn.Module):
         for width in WIDTHS:
             hidden = nn.relu(Dense(width)(hidden))
         score, alone = jnp.moveaxis(Dense(2, kernel_init=nn.initializers.zeros)(hidden), -1, 0)
-        return sharpness[0] * (score + jnp.asarray(bias)[rotation_class]), sharpness[1] * alone + shift
+        return sharpness[0] * (score + jnp.asarray(bias)[rotation_class]), sharpness[
+            1
+        ] * alone + shift
 
 
 def num_features(num_parts: int) -> int:
@@ -323,3 +326,45 @@ def _in_camera(
     return jax.tree.map(
         lambda leaf: jnp.moveaxis(leaf, 0, 1), Hypotheses(pose, probability, classes)
     )
+
+
+POSSIBLE = 0.1  # another reading of at least this probability is worth a word
+
+
+class Stated(Protocol):
+    """What ``other_readings_in_words`` reads of a prediction."""
+
+    hypotheses: Any
+
+
+def possible_others(result: Stated) -> list[int]:
+    """Which readings of a prediction, besides its answer, have more than 10 %."""
+    if result.hypotheses is None:
+        return []
+    probability = np.asarray(result.hypotheses.probability)
+    return [index for index in range(1, len(probability)) if probability[index] > POSSIBLE]
+
+
+def in_words(result: Stated, category: Category) -> list[str]:
+    """How probable an answer is, and what else the cloud may be; nothing where it is not doubted.
+
+    Args:
+      result: a ``Prediction`` without batch axes.
+      category: names the parts.
+    """
+    if result.hypotheses is None:
+        return []
+    first = float(np.asarray(result.hypotheses.probability)[0])
+    others = possible_others(result)
+    if not others and first > 1.0 - POSSIBLE:
+        return []
+    lines = [f"this answer is right with {100 * first:.0f} %"]
+    rotation = np.asarray(result.hypotheses.pose.rotation, np.float64)[:, 0]
+    for index in others:
+        vector = Rotation.from_matrix(rotation[0].T @ rotation[index]).as_rotvec(degrees=True)
+        angle = np.linalg.norm(vector)
+        axis = "xyz"[int(np.abs(vector).argmax())]
+        chance = 100 * float(result.hypotheses.probability[index])
+        turned = f"the {category.parts[0]} turned by {angle:.0f} deg about its {axis} axis"
+        lines.append(f"another reading has {chance:.0f} %: {turned}")
+    return lines

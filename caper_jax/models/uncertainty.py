@@ -41,6 +41,8 @@ class Calibration:
       translation: network units.
       state: radians or network units.
       low, high: range of the evidence it was fitted on, beyond which nothing changes.
+      size: network units, along each axis of the part; two more columns, for ``foreshortening``
+        and its square. None where it was not fitted.
     """
 
     rotation: Float[np.ndarray, "K E"]
@@ -48,6 +50,7 @@ class Calibration:
     state: Float[np.ndarray, "J E"]
     low: Float[np.ndarray, "E-1"]
     high: Float[np.ndarray, "E-1"]
+    size: Float[np.ndarray, "K 3 E+2"] | None = None
 
 
 def evidence(
@@ -100,6 +103,41 @@ def radii(
     )
 
 
+def foreshortening(
+    rotation: Float[Array, "*batch K 3 3"], translation: Float[Array, "*batch K 3"]
+) -> Float[Array, "*batch K 3"]:
+    """How little is seen of a part's extent along each of its axes: 1 along the ray to it, else 0.
+
+    What a depth image says of the thickness of a plate that faces the camera is nothing.
+
+    Args:
+      rotation: part -> camera.
+      translation: of the part, in the unit of the camera's frame.
+    """
+    ray = linalg.unit(translation)
+    return jnp.abs((rotation * ray[..., :, None]).sum(-2))
+
+
+def size_radii(
+    calibration: Calibration,
+    evidence: Float[Array, "B K E"],
+    foreshortened: Float[Array, "B K 3"],
+) -> Float[Array, "B K 3"] | None:
+    """Radii that hold the true extents nine times in ten, network units; None if not fitted."""
+    if calibration.size is None:
+        return None
+    inside = jnp.clip(evidence, calibration.low, calibration.high)
+    inputs = size_inputs(inside, foreshortened)
+    return jnp.exp((inputs * calibration.size[..., :-1]).sum(-1) + calibration.size[..., -1])
+
+
+def size_inputs(evidence: Array, foreshortened: Array) -> Array:
+    """[B, K, 3, E + 2] what the deviation of each extent follows from."""
+    shape = (*foreshortened.shape, evidence.shape[-1])
+    seen = jnp.stack([foreshortened, jnp.square(foreshortened)], -1)
+    return jnp.concatenate([jnp.broadcast_to(evidence[..., None, :], shape), seen], -1)
+
+
 def pose_covariance(
     rotation_std: Float[ArrayLike, "*batch"], translation_std: Float[ArrayLike, "*batch"]
 ) -> Float[Array, "*batch 6 6"]:
@@ -129,6 +167,8 @@ def from_card(section: Mapping[str, Any], num_parts: int, source: str) -> Calibr
         "low": (ALL_EVIDENCE,),
         "high": (ALL_EVIDENCE,),
     }
+    if "size" in section:  # older cards have none
+        shapes["size"] = (num_parts, 3, ALL_EVIDENCE + 3)
     values = {}
     for name, shape in shapes.items():
         try:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from caper_jax.articulation.category import Viewpoint
+from caper_jax.articulation.pose import ArticulatedPose
 
 # Largest change over a clip: azimuth, elevation and roll [rad], and distance (relative).
 _ARC = np.array([np.radians(34.0), np.radians(9.0), np.radians(9.0), 0.15])
@@ -167,3 +168,20 @@ def _turn_aside(offset):
         ]
     )
     return jnp.eye(4).at[:3, :3].set(rotation)
+
+
+def gravity(pose: ArticulatedPose, view: Viewpoint) -> Float[np.ndarray, "*batch 3"]:
+    """The way things fall in generated frames: across the table, which is below the camera.
+
+    Args:
+      pose: ground truth [..., K, ...].
+      view: which axis of the root points up.
+
+    Returns:
+      Unit vectors in the camera frame.
+    """
+    up = np.asarray(pose.rotation)[..., 0, :, "xyz".index(view.up)]
+    if view.either_side:
+        beyond = (up * np.asarray(pose.translation)[..., 0, :]).sum(-1, keepdims=True) > 0
+        up = np.where(beyond, -up, up)
+    return -up

@@ -9,6 +9,7 @@ import jax
 
 from caper_jax.data.types import Batch, Frame
 from caper_jax.errors import CaperError
+from caper_jax.synthetic.camera import gravity
 from caper_jax.synthetic.frames import FRAMES_AT_A_TIME, Generator
 from caper_jax.synthetic.instances import split_key
 
@@ -78,4 +79,5 @@ class GeneratedDataset:
             visible=row.visible,
             visibility=row.visibility,
             instance=str(row.instance),
+            gravity=gravity(row.pose, self.category.viewpoint),
         )

@@ -43,7 +43,6 @@ from caper_jax.synthetic.frames import Generator
 from caper_jax.training.fit_uncertainty import (
     BATCH,
     SPLIT,
-    calibrate,
     disturbed,
     mixed_frames,
     sensors_alone,
@@ -51,7 +50,6 @@ from caper_jax.training.fit_uncertainty import (
 from caper_jax.training.small_fits import minimize
 
 FRAMES = 12_288  # of right objects, and about as many wrong ones
-_PER_CALIBRATED = 3  # frames, for each that standard deviations are fitted on
 _FEWEST = 12 * BATCH
 FALSE_ALARMS = 0.01  # of right objects that are called wrong
 _OTHER_SIZES = ((0.08, 0.5), (2.0, 12.0))
@@ -150,24 +148,6 @@ def add_plausibility(
     write_fitted(directory, "plausibility", fitted)
     origin = {"frames": frames, "seed": seed, "false_alarms": FALSE_ALARMS}
     write_card(directory, {**estimator.card, "plausibility": origin})
-
-
-def add_calibration(
-    directory: str | Path, category: str | Category, config: GeneratorConfig, frames: int, seed: int
-) -> None:
-    """Fits what a model says of its own estimates, and writes it: plausibility, then deviations.
-
-    Args:
-      directory, category, config, seed: see ``add_plausibility``.
-      frames: for the standard deviations; three times as many for the classifier.
-
-    Raises:
-      CaperError: see ``add_plausibility`` and ``fit_uncertainty.calibrate``.
-    """
-    add_plausibility(directory, category, config, _PER_CALIBRATED * frames, seed)
-    estimator = load(category, directory)
-    section = calibrate(estimator, config, frames, seed)
-    write_card(directory, {**estimator.card, "calibration": section})
 
 
 def check_frame_count(frames: int) -> None:

@@ -20,7 +20,7 @@ from caper_jax.data.types import Batch
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, estimate
 from caper_jax.lie import so3
-from caper_jax.models.uncertainty import COVERAGE
+from caper_jax.models.uncertainty import COVERAGE, foreshortening, size_inputs
 from caper_jax.progress import progress
 from caper_jax.synthetic.frames import Generator
 from caper_jax.synthetic.instances import split_key
@@ -61,7 +61,8 @@ def calibrate(
         jax.device_get(measure(estimator.variables, batch))
         for batch in mixed_frames(estimator, configs, SPLIT, frames, seed, "calibrating")
     ]
-    evidence, *errors = (np.concatenate(column)[:frames] for column in zip(*rows, strict=True))
+    columns = [np.concatenate(column)[:frames] for column in zip(*rows, strict=True)]
+    evidence, seen, size_errors, *errors = columns
     low, high = np.quantile(evidence, [0.01, 0.99], axis=(0, 1))
     inside = np.clip(evidence, low, high)
     rotation, translation, state = (
@@ -71,7 +72,15 @@ def calibrate(
         ]
         for error, count in zip(errors, (error.shape[1] for error in errors), strict=True)
     )
-    section = {"rotation": rotation, "translation": translation, "state": state}
+    inputs = np.asarray(size_inputs(inside, seen))
+    size = [
+        [
+            quantile_regression(inputs[:, k, a], np.log(np.maximum(errors, _SMALLEST)))
+            for a, errors in enumerate(np.moveaxis(of_part, -1, 0))
+        ]
+        for k, of_part in enumerate(np.moveaxis(size_errors, 1, 0))
+    ]
+    section = {"rotation": rotation, "translation": translation, "state": state, "size": size}
     section |= {"low": low, "high": high}
     rounded = {name: np.round(np.asarray(value), 5).tolist() for name, value in section.items()}
     data = {"frames": frames, "split": SPLIT, "seed": seed, "noise": list(cameras)}
@@ -180,14 +189,17 @@ def quantile_regression(
 
 
 def _measure(variables, batch: Batch, estimator: Estimator):
-    """(evidence [B, K, E], errors of rotation [B, K], translation [B, K], state [B, J])."""
+    """(evidence [B, K, E], foreshortening [B, K, 3], errors of size [B, K, 3], rotation [B, K],
+    translation [B, K], state [B, J])."""
     category = estimator.category
     prediction = estimate(variables, batch.points, category, estimator.network)
     pose, truth = prediction.pose, nearer_symmetry(prediction.pose, batch.pose, category)
     shift = (pose.translation - truth.translation) * category.unit
     state = jnp.abs(pose.joint_state - truth.joint_state) * category.state_units
     angle = so3.geodesic_distance(pose.rotation, truth.rotation)
-    return prediction.evidence, angle, jnp.linalg.norm(shift, axis=-1), state
+    seen = foreshortening(pose.rotation, pose.translation)
+    size = jnp.abs(pose.size - truth.size) * category.unit
+    return prediction.evidence, seen, size, angle, jnp.linalg.norm(shift, axis=-1), state
 
 
 def nearer_symmetry(

@@ -44,7 +44,7 @@ from caper_jax.models.files import (
 )
 from caper_jax.synthetic.frames import Generator
 from caper_jax.training import fit_refiner, parallel
-from caper_jax.training.fit_plausibility import add_calibration
+from caper_jax.training.calibration import add_calibration
 from caper_jax.training.loop import FitResult, fit
 from caper_jax.training.objective import Objective
 from caper_jax.training.run_directory import CONFIG_FILE, STARTED_FROM

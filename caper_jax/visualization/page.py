@@ -122,6 +122,10 @@ def _scene_data(scene: Scene) -> dict[str, Any]:
         "counts": np.bincount(labels, minlength=category.num_parts).tolist(),
         "estimate": _pose_data(scene.pose, category),
         "truth": None if scene.truth is None else _pose_data(scene.truth, category),
+        "others": [
+            {"probability": round(chance, 3), "corners": _rounded(box_corners(pose))}
+            for chance, pose in scene.others
+        ],
         "image": None if scene.depth is None else _image_address(scene, scene.depth),
     }
 

@@ -39,6 +39,7 @@ DPI = 110
 ROW_HEIGHT = 3.9  # inches
 WIDTHS = (3.4, 3.4, 3.4, 4.3)  # inches: three views and the legend
 STRAY, WARNING = "#9a9a9a", "#B3261E"
+GHOST = 0.45  # opacity of other readings
 INK, PAPER, TRUTH = "#1a1a1a", "#f4f4f2", "#333333"
 
 Projection = Callable[[np.ndarray], np.ndarray]
@@ -169,6 +170,11 @@ def _draw_objects(
             for a, b in BOX_EDGES:
                 line = flat(corners[[a, b]])
                 axes.plot(*line.T, color=TRUTH, linewidth=0.9, linestyle=(0, (5, 3)), zorder=3)
+    for _, other in scene.others:
+        for part, corners in enumerate(box_corners(other)):
+            for a, b in BOX_EDGES:
+                line = flat(corners[[a, b]])
+                axes.plot(*line.T, color=colors[part], linewidth=1.2, alpha=GHOST, zorder=3)
     for part, corners in enumerate(box_corners(scene.pose)):
         for (a, b), hidden in zip(BOX_EDGES, hidden_edges(corners, eye), strict=True):
             style: dict[str, Any] = (
@@ -220,6 +226,8 @@ def _draw_legend(axes: Axes, scene: Scene) -> None:
         rows.append(("joint", "black", f"{joint_name(category, index)}   {state}{known}"))
     if truth is not None:
         rows.append(("truth", TRUTH, "ground truth"))
+    for chance, _ in scene.others:
+        rows.append(("other", part_color(0), f"may also be this ({100 * chance:.0f} %)"))
     if (np.asarray(scene.labels) < 0).any():
         rows.append(("part", STRAY, "stray points, left out"))
     pitch = min(0.095, 0.9 / (len(rows) + 1))
@@ -241,6 +249,8 @@ def _draw_legend(axes: Axes, scene: Scene) -> None:
         elif kind == "joint":
             arrow = {"arrowstyle": "-|>", "color": color, "linewidth": 1.8}
             axes.annotate("", xy=(0.135, y), xytext=(0.045, y), arrowprops=arrow)
+        elif kind == "other":
+            axes.plot([0.045, 0.135], [y, y], color=color, linewidth=1.2, alpha=GHOST)
         else:
             axes.plot([0.045, 0.135], [y, y], color=color, linewidth=1, linestyle=(0, (5, 3)))
         axes.text(0.17, y, text, fontsize=11, color=INK, va="center", parse_math=False)

@@ -17,10 +17,13 @@ from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.data.types import Frame, pose_shapes
 from caper_jax.errors import CaperError
+from caper_jax.estimator import Prediction
 from caper_jax.evaluation.metrics import PoseErrors, pose_errors, pose_errors_up_to_symmetry
 from caper_jax.evaluation.report import text_table
 from caper_jax.geometry import boxes
 from caper_jax.lie import so3
+from caper_jax.models import plausibility
+from caper_jax.models.hypotheses import possible_others
 
 # Okabe and Ito's colors, which color-blind readers can tell apart; yellow, hard to see on white,
 # comes last.
@@ -55,6 +58,7 @@ class Scene:
       mask: [H, W] bool, the object in ``depth``, if known.
       intrinsics: [3, 3] of ``depth``; needed with it.
       warning: why the estimate should not be believed, in one line; "" where it may be.
+      others: other readings of the cloud, each with its probability, likeliest first.
 
     Raises:
       CaperError: shapes that do not fit together, or numbers that are not finite.
@@ -70,6 +74,7 @@ class Scene:
     mask: np.ndarray | None = None
     intrinsics: np.ndarray | None = None
     warning: str = ""
+    others: tuple[tuple[float, ArticulatedPose], ...] = ()
 
     @classmethod
     def of_frame(
@@ -80,6 +85,7 @@ class Scene:
         labels: Any,
         pose: ArticulatedPose,
         warning: str = "",
+        others: tuple[tuple[float, ArticulatedPose], ...] = (),
     ) -> Scene:
         """A frame of data with its estimate; what the depth image does not measure is 0 there."""
         depth = frame.depth
@@ -94,6 +100,24 @@ class Scene:
             mask=frame.mask,
             intrinsics=frame.intrinsics,
             warning=warning,
+            others=others,
+        )
+
+    @classmethod
+    def of_prediction(cls, frame: Frame, category: Category, prediction: Prediction) -> Scene:
+        """A frame with what the estimator says of it, without batch axes."""
+        others = []
+        if prediction.hypotheses is not None:
+            stated = prediction.hypotheses
+            for index in possible_others(prediction):
+                pose = jax.tree.map(lambda leaf, i=index: np.asarray(leaf)[i], stated.pose)
+                others.append((float(stated.probability[index]), pose))
+        return cls.of_frame(
+            frame,
+            category,
+            *(prediction.points, prediction.labels, prediction.pose),
+            warning=plausibility.implausible_because(prediction, category),
+            others=tuple(others),
         )
 
     def __post_init__(self) -> None:
@@ -126,9 +150,11 @@ class Scene:
 
     @property
     def poses(self) -> tuple[tuple[str, ArticulatedPose], ...]:
-        """The estimate and, where known, the truth, by name."""
+        """The estimate, the truth where it is known, and other readings, by name."""
         estimate = (("estimate", self.pose),)
-        return (*estimate, ("truth", self.truth)) if self.truth is not None else estimate
+        others = tuple((f"reading {n}", pose) for n, (_, pose) in enumerate(self.others, start=2))
+        known = (("truth", self.truth),) if self.truth is not None else ()
+        return (*estimate, *known, *others)
 
 
 def part_color(part: int) -> str:
@@ -261,7 +287,7 @@ def scene_errors(scene: Scene) -> dict[str, PoseErrors]:
     """
     if scene.truth is None:
         return {}
-    estimate, truth = (_batched(pose) for _, pose in scene.poses)
+    estimate, truth = _batched(scene.pose), _batched(scene.truth)
     errors = {"error": pose_errors(estimate, truth, scene.category)}
     best = pose_errors_up_to_symmetry(estimate, truth, scene.category)
     if not np.array_equal(best.rotation_deg, errors["error"].rotation_deg):

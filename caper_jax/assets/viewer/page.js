@@ -3,7 +3,7 @@
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
-const shown = {points: true, boxes: true, axes: true, truth: true};
+const shown = {points: true, boxes: true, axes: true, truth: true, others: true};
 const surface = byId("lines");
 const layers = new Layers(byId("points"), surface);
 let scene, camera, states, waiting = false;
@@ -42,6 +42,9 @@ function choose(index) {
   [...byId("scenes").children].forEach((button, i) =>
     button.setAttribute("aria-pressed", String(i === index)));
   byId("truth-toggle").hidden = !scene.truth;
+  byId("others-toggle").hidden = !scene.others.length;
+  byId("others-toggle").querySelector("span").textContent = "Other readings: " +
+    scene.others.map(({probability}) => `${Math.round(100 * probability)} %`).join(", ");
   byId("warning").hidden = !scene.warning;
   byId("warning").textContent = `Do not believe this: ${scene.warning}`;
   byId("input").hidden = !scene.image;

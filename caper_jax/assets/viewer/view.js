@@ -124,6 +124,7 @@ class Layers {
       if (layers.axes) for (const [a, b] of scene.truth.segments)
         this.line(a, b, this.ink, 1.2, [6, 4]);
     }
+    if (layers.others) this.drawOthers(scene);
     if (layers.boxes) this.drawBoxes(scene, motions);
     if (layers.axes) this.drawAxes(scene, motions);
   }
@@ -189,6 +190,15 @@ class Layers {
   drawTruth(scene) {
     for (const corners of scene.truth.corners)
       for (const [a, b] of scene.edges) this.line(corners[a], corners[b], this.ink, 1, [5, 4]);
+  }
+
+  drawOthers(scene) {
+    this.lines.globalAlpha = 0.45;
+    for (const {corners} of scene.others)
+      corners.forEach((box, part) => {
+        for (const [a, b] of scene.edges) this.line(box[a], box[b], scene.parts[part].color, 1.2, []);
+      });
+    this.lines.globalAlpha = 1;
   }
 
   drawBoxes(scene, motions) {

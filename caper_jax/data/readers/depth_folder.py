@@ -5,6 +5,8 @@ Layout of one video::
     <video>/depth/*.png        16-bit millimeters (or as ``read_depth`` takes them)
     <video>/mask/*.png         not black on the object; of the same name as the depth image
     <video>/intrinsics.json    the camera, as ``read_intrinsics`` takes it
+    <video>/gravity.json       optional: the way things fall, [x, y, z] in the camera's frame, or
+                               {"<file>": [x, y, z]} where the camera moves
 
 A root is one such folder, or a folder of several. Frames come in the natural order of their names
 (2 before 10). A frame without a mask, or with a black one, does not show the object.
@@ -18,13 +20,13 @@ from typing import Any
 import numpy as np
 
 from caper_jax.data.clouds import MIN_POINTS, cloud_from_depth
-from caper_jax.data.images import read_depth, read_intrinsics, read_mask
+from caper_jax.data.images import read_depth, read_intrinsics, read_json, read_mask
 from caper_jax.data.readers.base import ALL, DatasetReader, natural_order
 from caper_jax.data.types import Frame
 from caper_jax.errors import CaperError
 
 FORMAT = "folder"
-_DEPTH, _MASK, _CAMERA = "depth", "mask", "intrinsics.json"
+_DEPTH, _MASK, _CAMERA, _GRAVITY = "depth", "mask", "intrinsics.json", "gravity.json"
 
 
 class DepthFolder(DatasetReader):
@@ -83,13 +85,42 @@ class DepthFolder(DatasetReader):
         points = np.zeros((0, 3), np.float32)
         if np.count_nonzero(mask & np.isfinite(depth) & (depth > 0)) >= MIN_POINTS:
             points = cloud_from_depth(depth, mask, intrinsics, self.num_points).points
-        return Frame(name=name, points=points, depth=depth, mask=mask, intrinsics=intrinsics)
+        return Frame(
+            name=name,
+            points=points,
+            depth=depth,
+            mask=mask,
+            intrinsics=intrinsics,
+            gravity=_gravity(home / _GRAVITY, path.stem),
+        )
 
 
 def is_depth_folder(root: str | Path) -> bool:
     """Whether a folder is a video of this layout, or holds one."""
     root = Path(root)
     return root.is_dir() and bool(_videos_in(root))
+
+
+def _gravity(path: Path, name: str) -> np.ndarray | None:
+    """Unit vector for the frame of a name; None without the file, or where it lacks the frame.
+
+    Raises:
+      CaperError: something else than a direction.
+    """
+    if not path.is_file():
+        return None
+    content = read_json(path)
+    vector = content.get(name) if isinstance(content, dict) else content
+    if vector is None:
+        return None
+    try:
+        down = np.asarray(vector, np.float64).reshape(3)
+        length = float(np.linalg.norm(down))
+    except (TypeError, ValueError):
+        length = np.nan
+    if not 1e-6 < length < np.inf:
+        raise CaperError(f"{path}: gravity must be [x, y, z], a direction, got {vector}")
+    return down / length
 
 
 def _videos_in(root: Path) -> list[Path]:
