@@ -126,7 +126,8 @@ def estimate(
         unknown. Clouds are leveled by it, whatever roll the camera has, and objects that stand as
         they are used are not read as lying (``Category.stands``).
       hypotheses: static, H readings to state, at most 4. With 1 only the probability of the answer
-        is computed, at no cost; more cost up to half as much again, where the answer is in doubt.
+        is computed, at no cost; each other one costs a pass of stage II where the answer is in
+        doubt.
 
     Returns:
       Prediction with leading axis B and M = N.

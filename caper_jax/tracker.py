@@ -14,7 +14,7 @@ from caper_jax.articulation.category import Category
 from caper_jax.config import TrackerConfig, from_dict, override
 from caper_jax.data.clouds import FARTHEST_M, MIN_POINTS, as_cloud, sample_points, shows_object
 from caper_jax.errors import CaperError
-from caper_jax.estimator import Estimator, load
+from caper_jax.estimator import Estimator, load, unit_gravity
 from caper_jax.tracking.state import Observation, TrackerState
 from caper_jax.tracking.step import TrackResult, given_state, initial_state, track_step
 
@@ -87,7 +87,7 @@ class Tracker:
         pose = _first_pose(rotation, translation, self.estimator.category.num_parts)
         self.state = self._given(self.estimator.variables, frame, *pose)
 
-    def observe(self, points, labels=None) -> Observation:
+    def observe(self, points, labels=None, gravity=None) -> Observation:
         """The observation that the step takes, from any number of points.
 
         Args:
@@ -95,23 +95,29 @@ class Tracker:
             beyond 50 m are left out. Fewer than 48 usable points that differ count as a frame
             that does not show the object.
           labels: [N] int parts, -1 where unknown; by default all are predicted.
+          gravity: [3] the way things fall in this frame, in the camera's frame and of any length;
+            see ``Estimator.__call__``. Zeros where it is unknown in this frame alone.
 
         Raises:
-          CaperError: wrong shape or dtype, points in millimeters or behind the camera, or labels
-            that are no parts.
+          CaperError: wrong shape or dtype, points in millimeters or behind the camera, labels that
+            are no parts, or a gravity that is no direction.
         """
         count = self.estimator.network.num_points
         points = as_cloud(points)
         if labels is not None:
             labels = self._checked_labels(labels, len(points))
+        down = None
+        if gravity is not None:
+            down = np.asarray(gravity, np.float32)
+            if down.shape != (3,) or down.any():
+                down = unit_gravity(gravity, 1)[0]
         unknown = np.full(count, -1, np.int32)
         if not shows_object(points):
             nothing = np.zeros((count, 3), np.float32)
-            return Observation(nothing, np.asarray(False), unknown)
+            return Observation(nothing, np.asarray(False), unknown, down)
         cloud = sample_points(points, count)
-        if labels is None:
-            return Observation(cloud.points, np.asarray(True), unknown)
-        return Observation(cloud.points, np.asarray(True), labels[cloud.index])
+        chosen = unknown if labels is None else labels[cloud.index]
+        return Observation(cloud.points, np.asarray(True), chosen, down)
 
     def _checked_labels(self, labels, count: int) -> np.ndarray:
         labels = np.asarray(labels)
@@ -122,9 +128,9 @@ class Tracker:
             raise CaperError(f"labels must be integers from -1 to {parts - 1}")
         return labels.astype(np.int32)
 
-    def __call__(self, points, labels=None) -> TrackResult:
+    def __call__(self, points, labels=None, gravity=None) -> TrackResult:
         """Tracks through the next frame; see ``observe`` for the arguments."""
-        observation = self.observe(points, labels)
+        observation = self.observe(points, labels, gravity)
         self.state, result = self.step(self.estimator.variables, self.state, observation)
         return result
 

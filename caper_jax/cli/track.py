@@ -199,7 +199,7 @@ def warm_up(tracker: Tracker) -> None:
     import jax
     import numpy as np
 
-    jax.block_until_ready(tracker(np.zeros((0, 3), np.float32)))
+    jax.block_until_ready(tracker(np.zeros((0, 3), np.float32), gravity=np.zeros(3)))
     tracker.reset()
 
 
@@ -255,8 +255,9 @@ def track_stream(tracker: Tracker, frames: Iterable[LiveFrame]) -> None:
     try:
         for frame in frames:
             began = time.perf_counter()
+            gravity = np.zeros(3) if frame.gravity is None else frame.gravity
             try:
-                result = jax.block_until_ready(tracker(frame.points))
+                result = jax.block_until_ready(tracker(frame.points, gravity=gravity))
             except CaperError as error:
                 raise CaperError(f"frame {frame.sequence}: {error}") from error
             seconds.append(time.perf_counter() - began)

@@ -1,14 +1,15 @@
 """Clouds as a stream of bytes, for pipes and sockets.
 
-A stream is a sequence of frames and nothing else; every frame is a header of 16 bytes and its
+A stream is a sequence of frames and nothing else; every frame is a header of 16 or 28 bytes and its
 points. All numbers are little-endian::
 
     offset  type         content
     0       4 bytes      magic, the letters CAPR
-    4       uint32       version of this format, 1
+    4       uint32       version of this format, 1, or 2 with gravity
     8       uint32       N, number of points; 0 for a frame that does not show the object
     12      uint32       sequence, a number that the sender gives the frame
-    16      float32 * 3N x, y, z of every point: meters, camera frame (OpenCV)
+    16      float32 * 3  version 2 only: the way things fall, camera frame; zeros where unknown
+    16, 28  float32 * 3N x, y, z of every point: meters, camera frame (OpenCV)
 
 The stream may end after any whole frame.
 
@@ -22,7 +23,7 @@ from __future__ import annotations
 import struct
 import threading
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import BinaryIO
 
 import numpy as np
@@ -30,7 +31,7 @@ import numpy as np
 from caper_jax.errors import CaperError
 
 MAGIC = b"CAPR"
-VERSION = 1
+VERSION, WITH_GRAVITY = 1, 2
 MAX_POINTS = 1 << 22  # more than any depth camera has pixels: 50 MB
 _HEADER = struct.Struct("<4sIII")
 
@@ -43,29 +44,39 @@ class LiveFrame:
       sequence: the number that its sender gave it.
       points: [N, 3] float32 meters, camera frame; N may be 0.
       skipped: frames that came since the last one and were passed over.
+      gravity: [3] float32, the way things fall in the camera's frame; None without.
     """
 
     sequence: int
     points: np.ndarray
     skipped: int = 0
+    gravity: np.ndarray | None = None
 
 
-def pack_frame(points: np.ndarray, sequence: int = 0) -> bytes:
+def pack_frame(points: np.ndarray, sequence: int = 0, gravity: np.ndarray | None = None) -> bytes:
     """The bytes of one frame.
 
     Args:
       points: [N, 3] meters, camera frame; N may be 0.
       sequence: 0 or more; counts modulo 2^32.
+      gravity: [3] the way things fall in the camera's frame, of any length; zeros where it is
+        unknown. A stream has it in every frame or in none.
 
     Raises:
-      CaperError: points of another shape, or too many.
+      CaperError: points or gravity of another shape, or too many points.
     """
     points = np.asarray(points)
     if points.ndim != 2 or points.shape[1] != 3:
         raise CaperError(f"points must be [N, 3], got {points.shape}")
     if len(points) > MAX_POINTS:
         raise CaperError(f"a frame takes {MAX_POINTS} points at most, got {len(points)}")
-    header = _HEADER.pack(MAGIC, VERSION, len(points), sequence % (1 << 32))
+    version = VERSION if gravity is None else WITH_GRAVITY
+    header = _HEADER.pack(MAGIC, version, len(points), sequence % (1 << 32))
+    if gravity is not None:
+        down = np.asarray(gravity, "<f4")
+        if down.shape != (3,):
+            raise CaperError(f"gravity must be [3], got {down.shape}")
+        header += down.tobytes()
     return header + points.astype("<f4").tobytes()
 
 
@@ -86,21 +97,23 @@ def read_frames(stream: BinaryIO) -> Iterator[LiveFrame]:
                 f"frame {number} of the stream begins with {magic!r}, not {MAGIC!r}: this is no "
                 "stream of frames, or bytes were lost"
             )
-        if version != VERSION:
+        if version not in (VERSION, WITH_GRAVITY):
             raise CaperError(
-                f"frame {number} of the stream has version {version}, this program reads {VERSION}"
+                f"frame {number} of the stream has version {version}, this program reads {VERSION} "
+                f"and {WITH_GRAVITY}"
             )
         if count > MAX_POINTS:
             raise CaperError(
                 f"frame {number} of the stream claims {count} points, more than {MAX_POINTS}: "
                 "the stream is damaged"
             )
-        size = 12 * count
-        content = _read(stream, size, f"frame {number}")
-        if len(content) < size:
+        rows = count + (version == WITH_GRAVITY)
+        content = _read(stream, 12 * rows, f"frame {number}")
+        if len(content) < 12 * rows:
             raise CaperError(f"the stream ends inside frame {number}, before its points")
-        points = np.frombuffer(content, "<f4").reshape(count, 3).astype(np.float32)
-        yield LiveFrame(sequence, points)
+        numbers = np.frombuffer(content, "<f4").reshape(rows, 3).astype(np.float32)
+        points, gravity = numbers[rows - count :], numbers[0] if rows > count else None
+        yield LiveFrame(sequence, points, gravity=gravity)
         number += 1
 
 
@@ -150,7 +163,7 @@ class Newest:
                 if self._error is not None:
                     raise self._error
                 return
-            yield LiveFrame(frame.sequence, frame.points, skipped)
+            yield replace(frame, skipped=skipped)
 
     def _fill(self, source: Iterable[LiveFrame]) -> None:
         try:

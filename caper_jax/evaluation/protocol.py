@@ -207,7 +207,7 @@ class _EstimatorStep:
     """Estimates and errors as one program, each device on its own rows."""
 
     def __init__(
-        self, estimator: Estimator, category: Category, mesh: Mesh, use_gravity: bool
+        self, estimator: Estimator, category: Category, mesh: Mesh, use_gravity: bool = False
     ) -> None:
         self._use_gravity = use_gravity
         self._variables = jax.device_put(estimator.variables, replicated(mesh))

@@ -90,7 +90,7 @@ def track_video(
             raise CaperError(f"frame {frame.name!r} has no part labels to give to the tracker")
         labels = frame.labels if given_masks else None
         if number == 0:
-            tracker(frame.points, labels)  # compiles, if nothing did before
+            tracker(frame.points, labels, frame.gravity)  # compiles, if nothing did before
             tracker.reset()
             if start == "truth":
                 if frame.truth is None:
@@ -98,7 +98,7 @@ def track_video(
                 pose = frame.truth
                 tracker.reset(frame.points, pose.rotation, pose.translation, labels)
         began = time.perf_counter()
-        result = jax.block_until_ready(tracker(frame.points, labels))
+        result = jax.block_until_ready(tracker(frame.points, labels, frame.gravity))
         seconds.append(time.perf_counter() - began)
         results.append(jax.tree.map(np.asarray, result))
         names.append(frame.name)

@@ -9,6 +9,7 @@ and one for "none of these", give their probabilities. ``training.fit_hypotheses
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Protocol
 
 import flax.linen as nn
@@ -173,10 +174,10 @@ def other_readings(
     def read(classes: Int[Array, "B"]) -> tuple[StageEstimate, Float[Array, "B F"]]:
         turn = jnp.asarray(CUBE_ROTATIONS, cloud.dtype)[classes]
         start = rotate_pose(outputs.estimate.root, turn)
-        _, seen = see_parts(variables, cloud, start, category, network, space)
+        estimate, seen = see_parts(variables, cloud, start, category, network, space)
         increment = increment_transform(seen.increment, network.increment)
-        pose = se3.compose(start, increment)
-        estimate, seen = see_parts(variables, cloud, pose, category, network, space)
+        # As in tracking, one look gives both where the root is and all the rest.
+        estimate = replace(estimate, root=se3.compose(start, increment))
         own = StageOutputs(
             estimate=estimate,
             segmentation=seen.segmentation,
@@ -192,7 +193,8 @@ def other_readings(
         expected = jnp.take_along_axis(logits, classes[:, None], axis=1)
         return refined, _features(own, fit, expected, 0.0)
 
-    estimate, features = jax.vmap(read)(classes)
+    # One after the other: side by side they leave a processor's caches, and take twice as long.
+    estimate, features = jax.lax.map(read, classes)
     return Readings(estimate, features, classes)
 
 
@@ -227,7 +229,7 @@ def state_hypotheses(
     settled = certain > SETTLED
     turns = jnp.asarray(CUBE_ROTATIONS, refined.root.dtype)[classes]
     turned = jax.tree.map(lambda leaf: jnp.stack([leaf] * (number - 1)), refined)
-    turned = turned.replace(root=rotate_pose(turned.root, turns))
+    turned = replace(turned, root=rotate_pose(turned.root, turns))
     left = jnp.broadcast_to((1.0 - certain) / number, classes.shape)
     alike = jnp.concatenate([certain[None], left])
 

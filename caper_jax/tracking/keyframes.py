@@ -86,6 +86,7 @@ def update_keyframe(
     variables,
     points,
     labels,
+    gravity,
     tracked: PoseMeasurement,
     residual,
     state: TrackerState,
@@ -106,6 +107,7 @@ def update_keyframe(
 
     Args:
       variables, points, labels, category, network: as for ``measurement.measure``.
+      gravity: of the observation.
       tracked: the track's pose.
       residual: [] the track's ``box_residual`` in this frame.
       state: before this frame.
@@ -121,7 +123,7 @@ def update_keyframe(
         queried |= due
     static = jax.lax.cond(
         queried,
-        lambda: estimate_measurement(variables, points, labels, category, network),
+        lambda: estimate_measurement(variables, points, labels, gravity, category, network),
         lambda: tracked,
     )
     reason = static.reason  # before stage II, which has none, takes the estimate's place

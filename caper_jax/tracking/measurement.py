@@ -120,11 +120,15 @@ def measure(
 
 
 def estimate_measurement(
-    variables, points, labels, category: Category, network: NetworkConfig
+    variables, points, labels, gravity, category: Category, network: NetworkConfig
 ) -> PoseMeasurement:
-    """The pose that the single-frame estimator gives; arguments as for ``measure``."""
+    """The pose that the single-frame estimator gives.
+
+    Arguments as for ``measure``; gravity is that of ``state.Observation``.
+    """
     unit = category.unit
-    prediction = estimate(variables, points[None] / unit, category, network)
+    down = None if gravity is None else gravity[None]
+    prediction = estimate(variables, points[None] / unit, category, network, gravity=down)
     pose = jax.tree.map(lambda array: array[0], prediction.pose)
     poses = se3.from_rt(pose.rotation, pose.translation * unit)
     measurement = PoseMeasurement(

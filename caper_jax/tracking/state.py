@@ -19,11 +19,14 @@ class Observation:
       points: [N, 3] meters, camera frame; anything where ``present`` is false.
       present: [] bool, whether the frame shows the object at all.
       labels: [N] int32 part of each point where it is known, -1 where the tracker is to predict it.
+      gravity: [3] unit vector, the way things fall in the camera's frame; zeros where it is
+        unknown, None where it is so in all frames.
     """
 
     points: Float[AnyArray, "*frames N 3"]
     present: Bool[AnyArray, "*frames"]
     labels: Int[AnyArray, "*frames N"]
+    gravity: Float[AnyArray, "*frames 3"] | None = None
 
 
 @flax.struct.dataclass

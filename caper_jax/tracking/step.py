@@ -16,9 +16,10 @@ from caper_jax.articulation.pose import Array as AnyArray
 from caper_jax.articulation.pose import ArticulatedPose
 from caper_jax.config import NetworkConfig, RegistrationConfig, TrackerConfig
 from caper_jax.lie import se3
+from caper_jax.models.gravity import class_log_weights
 from caper_jax.models.pipeline import SMALLEST_SIZE
 from caper_jax.models.plausibility import FEW_POINTS, PLAUSIBLE, log_size, rules, size_bounds
-from caper_jax.models.rotation_classes import NUM_CUBE_ROTATIONS
+from caper_jax.models.rotation_classes import NUM_CUBE_ROTATIONS, log_odds
 from caper_jax.tracking.keyframes import (
     add_log_odds,
     chamfer_energy,
@@ -244,12 +245,13 @@ def _track_step(
         found.rotation_log_odds,
         state.reason,
     )
+    new_odds = found.rotation_log_odds
+    if frame.gravity is not None:
+        new_odds += log_odds(class_log_weights(root[:3, :3], frame.gravity, category))
     # Frames show the same object from nearly the same side, so that each counts for little.
-    log_odds = add_log_odds(
-        state.rotation_log_odds, jnp.clip(found.rotation_log_odds, -1.0, 1.0), config
-    )
-    is_rotated = (log_odds.max() > config.flip_log_odds) & ~state.lost
-    rotation_class = jnp.where(is_rotated, log_odds.argmax(), 0).astype(jnp.int32)
+    summed = add_log_odds(state.rotation_log_odds, jnp.clip(new_odds, -1.0, 1.0), config)
+    is_rotated = (summed.max() > config.flip_log_odds) & ~state.lost
+    rotation_class = jnp.where(is_rotated, summed.argmax(), 0).astype(jnp.int32)
 
     unmatched = match_cost(*against, (root, joints), config.registration)
     residual = box_residual(tracked, points)
@@ -272,6 +274,7 @@ def _track_step(
         variables,
         points,
         labels,
+        frame.gravity,
         tracked,
         residual,
         state,
@@ -326,7 +329,7 @@ def _track_step(
         num_inconsistent=jnp.where(
             replaced, config.patience - 1, jnp.where(settled, 0, num_inconsistent)
         ),
-        rotation_log_odds=jnp.where(replaced, 0.0, log_odds),
+        rotation_log_odds=jnp.where(replaced, 0.0, summed),
         rotation_votes=jnp.where(replaced, 0.0, correction.rotation_votes),
         init_frames_left=jnp.where(replaced, config.init_frames, left).astype(jnp.int32),
         lost=jnp.asarray(False),

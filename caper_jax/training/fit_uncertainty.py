@@ -72,7 +72,7 @@ def calibrate(
         ]
         for error, count in zip(errors, (error.shape[1] for error in errors), strict=True)
     )
-    inputs = np.asarray(size_inputs(inside, seen))
+    inputs = np.asarray(size_inputs(jnp.asarray(inside), jnp.asarray(seen)))
     size = [
         [
             quantile_regression(inputs[:, k, a], np.log(np.maximum(errors, _SMALLEST)))

@@ -38,6 +38,23 @@ def test_frames_come_back_from_pieces():
     assert list(read_frames(io.BytesIO())) == []
 
 
+def test_gravity_is_version_2():
+    header = struct.pack("<III", 2, 2, 7) + struct.pack("<3f", 0, 1, 0.5)
+    expected = b"CAPR" + header + struct.pack("<6f", *POINTS.ravel())
+    packed = pack_frame(POINTS, 7, gravity=[0, 1, 0.5])
+    assert packed == expected
+    empty = pack_frame(np.zeros((0, 3)), 8, gravity=np.zeros(3))
+    with_gravity, none, without = read_frames(Dribble(packed + empty + pack_frame(POINTS, 9)))
+    np.testing.assert_array_equal(with_gravity.points, POINTS)
+    np.testing.assert_array_equal(with_gravity.gravity, [0, 1, 0.5])
+    assert none.points.shape == (0, 3) and not none.gravity.any()
+    assert without.gravity is None
+    with pytest.raises(CaperError, match=r"gravity must be \[3\]"):
+        pack_frame(POINTS, gravity=[0, 1])
+    with pytest.raises(CaperError, match="ends inside frame 0"):
+        list(read_frames(io.BytesIO(packed[:30])))
+
+
 GOOD = pack_frame(POINTS)
 
 
@@ -45,7 +62,7 @@ GOOD = pack_frame(POINTS)
     ("content", "message"),
     [
         (b"RPAC" + GOOD[4:], r"frame 1 of the stream begins with b'RPAC'"),
-        (b"CAPR" + struct.pack("<III", 2, 0, 0), "frame 1 of the stream has version 2"),
+        (b"CAPR" + struct.pack("<III", 3, 0, 0), "frame 1 of the stream has version 3"),
         (b"CAPR" + struct.pack("<III", 1, 2**31, 0), "frame 1 of the stream claims 2147483648"),
         (GOOD[:7], "ends inside frame 1, after 7"),
         (GOOD[:16], "ends inside frame 1"),
