@@ -1,5 +1,6 @@
 """``caper estimate``: inputs it takes, outputs it writes, mistakes it names."""
 
+import dataclasses
 import json
 import os
 
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 from _helpers.frames import random_pose
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from caper_jax import cli, estimator
 from caper_jax.estimator import Prediction
 from caper_jax.models import plausibility
+from caper_jax.models.hypotheses import Hypotheses
 
 CAMERA = {"fx": 300.0, "fy": 310.0, "cx": 79.5, "cy": 59.5}
 
@@ -42,11 +45,11 @@ def seen(monkeypatch):
     clouds = []
 
     class Estimator:
-        def __call__(self, points):
+        def __call__(self, points, gravity=None):
             clouds.append(np.asarray(points))
             return prediction(points, random_pose(1))
 
-    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: Estimator())
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *_, **__: Estimator())
     return clouds
 
 
@@ -105,13 +108,13 @@ def test_pose_is_printed_and_written(files, seen, capsys):
 
 def test_what_is_not_plausible_is_said_in_one_line(files, monkeypatch, capsys):
     class Doubting:
-        def __call__(self, points):
+        def __call__(self, points, gravity=None):
             found = prediction(points, random_pose(1), plausibility.TOO_LARGE)
             labels = np.array(found.labels)
             labels[0, :7] = -1
             return found.replace(labels=labels)
 
-    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: Doubting())
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *_, **__: Doubting())
     outputs = ["--json", "pose.json", "--picture", "pose.png", "--page", "pose.html"]
     assert run(*IMAGE, "--mask", "mask.png", *outputs) == 0
     captured = capsys.readouterr()
@@ -130,6 +133,47 @@ def test_what_is_plausible_needs_no_warning(files, seen, capsys):
     assert "warning" not in capsys.readouterr().err
     record = json.loads((files / "pose.json").read_text())
     assert record["plausible"] is True and record["reason"] is None
+
+
+def test_other_readings_and_gravity(files, monkeypatch, capsys):
+    """A second reading of 23 %, turned by a half turn about y, and one of 2 %."""
+    turns = Rotation.from_euler("y", [[0], [180], [90]], degrees=True).as_matrix()
+    told = []
+
+    class Torn:
+        def __call__(self, points, gravity=None):
+            told.append(gravity)
+            found = prediction(points, random_pose(1))
+            pose = jax.tree.map(lambda leaf: np.repeat(leaf[:, None], 3, 1), found.pose)
+            rotation = pose.rotation[0] @ turns[:, None]
+            stated = Hypotheses(
+                dataclasses.replace(pose, rotation=rotation[None].astype(np.float32)),
+                np.array([[0.7, 0.23, 0.02]], np.float32),
+                np.zeros((1, 3), np.int32),
+            )
+            size = np.full((1, 2, 3), 0.0042, np.float32)
+            return dataclasses.replace(found, hypotheses=stated, size_std=size)
+
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *_, **__: Torn())
+    outputs = ["--json", "pose.json", "--picture", "pose.png", "--page", "pose.html"]
+    assert run(*IMAGE, "--mask", "mask.png", "--gravity", "0.1,1,0", *outputs) == 0
+    assert told == [(0.1, 1.0, 0.0)]
+    output = capsys.readouterr().out
+    assert "this answer is right with 70 %\n" in output
+    assert "another reading has 23 %: the base turned by 180 deg about its y axis\n" in output
+    assert "2 %" not in output
+    assert "of its size 4 x 4 x 4 mm" in output
+    record = json.loads((files / "pose.json").read_text())
+    assert [one["probability"] for one in record["hypotheses"]] == [0.7, 0.23, 0.02]
+    second = np.array(record["hypotheses"][1]["parts"][0]["rotation"])
+    first = np.array(record["parts"][0]["rotation"])
+    np.testing.assert_allclose(first.T @ second, turns[1], atol=1e-5)
+    np.testing.assert_allclose(record["parts"][1]["size_std"], 0.0042, rtol=1e-4)
+    assert '"probability":0.23' in (files / "pose.html").read_text()
+    assert run(*IMAGE, "--mask", "mask.png", "--gravity", "0,0,0") == 2
+    assert "'0,0,0' is no direction" in capsys.readouterr().err
+    assert run(*IMAGE, "--mask", "mask.png", "--gravity", "down") == 2
+    assert "'down' is not x,y,z" in capsys.readouterr().err
 
 
 def test_a_detection_box_takes_the_table_away(files, seen):
@@ -152,7 +196,7 @@ def test_clouds_and_depth_scale(files, seen):
 def test_objects_of_another_scale_and_cameras_that_are_not_level(files, seen, monkeypatch):
     asked = []
     load = estimator.load
-    monkeypatch.setattr("caper_jax.estimator.load", lambda *a: asked.append(a) or load(*a))
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *a, **_: asked.append(a) or load(*a))
     assert run("--points", "cloud.npy", "--object-scale", "2.5") == 0
     assert run("--points", "cloud.npy", "--camera-roll", "180") == 0
     assert asked == [("box", None, 2.5, 0.0), ("box", None, 1.0, 180.0)]
@@ -201,10 +245,10 @@ def test_a_mask_of_another_size_is_named(files, seen, capsys):
 
 def test_an_estimate_that_is_not_finite_is_an_error(files, seen, capsys, monkeypatch):
     class Lost:
-        def __call__(self, points):
+        def __call__(self, points, gravity=None):
             pose = jax.tree.map(lambda array: array * np.nan, random_pose(1))
             return prediction(points, pose)
 
-    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: Lost())
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *_, **__: Lost())
     assert run("--points", "cloud.npy", "--json", "pose.json") == 2
     assert "no finite pose" in capsys.readouterr().err and not os.path.exists("pose.json")

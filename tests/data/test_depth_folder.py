@@ -32,6 +32,23 @@ def test_frames_come_in_natural_order_with_their_clouds(tmp_path):
     np.testing.assert_allclose(fine[0].points[:, 2], 1.8, rtol=1e-6)
 
 
+def test_gravity_of_a_video_or_of_each_frame(tmp_path):
+    home = write_video(tmp_path / "kitchen")
+    assert DepthFolder(home, "laptop")[0].gravity is None
+    (home / "gravity.json").write_text("[0, 3, 4]")
+    data = DepthFolder(home, "laptop")
+    for index in range(3):
+        np.testing.assert_allclose(data[index].gravity, [0, 0.6, 0.8])
+    (home / "gravity.json").write_text('{"f2": [0, 2, 0]}')
+    data = DepthFolder(home, "laptop")
+    assert data[0].gravity is None
+    np.testing.assert_allclose(data[1].gravity, [0, 1, 0])
+    for wrong in ("[0, 0, 0]", "[0, 1]", '"down"'):
+        (home / "gravity.json").write_text(wrong)
+        with pytest.raises(CaperError, match=r"gravity.json: gravity must be \[x, y, z\]"):
+            DepthFolder(home, "laptop")[0]
+
+
 def test_a_root_of_several_videos(tmp_path):
     write_video(tmp_path / "take10", ("a",))
     write_video(tmp_path / "take2", ("a", "b"))

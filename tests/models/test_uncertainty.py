@@ -18,10 +18,11 @@ from caper_jax.articulation.symmetry import apply_symmetry
 from caper_jax.config import GeneratorConfig, to_dict
 from caper_jax.errors import CaperError
 from caper_jax.estimator import Estimator, load
+from caper_jax.lie import se3
 from caper_jax.models import uncertainty
 from caper_jax.models.files import write_model
 from caper_jax.reproduce.static import ball_share, interval_share
-from caper_jax.training import fit_plausibility, fit_uncertainty
+from caper_jax.training import fit_hypotheses, fit_plausibility, fit_uncertainty
 
 BOX = categories.get("box")
 
@@ -72,6 +73,23 @@ def test_radii_grow_with_the_evidence_up_to_what_was_seen():
     np.testing.assert_allclose(turn[:, 1], 0.1 * np.exp([0, 1, 2]), rtol=1e-5)
     np.testing.assert_allclose(shift, 0.2, rtol=1e-5)
     np.testing.assert_allclose(state[:, 0], np.exp(0.75), rtol=1e-5)  # of the part it holds
+
+
+def test_deviations_of_sizes_follow_from_what_is_seen_of_each_extent():
+    """A plate that faces the camera says nothing of its thickness."""
+    pose = se3.from_rt(np.eye(3), np.array([[[0.0, 0.0, 2.0], [3.0, 0.0, 4.0]]]))
+    seen = uncertainty.foreshortening(pose[..., :3, :3], pose[..., :3, 3])
+    np.testing.assert_allclose(seen[0], [[0, 0, 1], [0.6, 0, 0.8]], atol=1e-6)
+    zeros = [0.0] * uncertainty.ALL_EVIDENCE
+    rows = [[*zeros, 1.0, 2.0, float(np.log(0.1))]] * 3
+    fitted = uncertainty.from_card(section(size=[rows, rows]), 2, "card")
+    evidence = np.zeros((1, 2, uncertainty.ALL_EVIDENCE), np.float32)
+    radii = uncertainty.size_radii(fitted, evidence, seen)
+    np.testing.assert_allclose(radii, 0.1 * np.exp(seen + 2 * np.square(seen)), rtol=1e-5)
+    older = uncertainty.from_card(section(), 2, "card")
+    assert uncertainty.size_radii(older, evidence, seen) is None
+    with pytest.raises(CaperError, match="calibration size must be finite numbers"):
+        uncertainty.from_card(section(size=[rows]), 2, "card")
 
 
 def test_covariance_is_that_of_twists():
@@ -164,6 +182,7 @@ class TestModel:
             ),
         )
         monkeypatch.setattr(fit_plausibility, "_STEPS", 500)
+        monkeypatch.setattr(fit_hypotheses, "_STEPS", 500)
         command = ["calibrate", "--category", "box", "--weights", str(folder), "--frames"]
         assert cli.main([*command, "20"]) == 2
         assert "320 frames or more, got 20" in capsys.readouterr().err
@@ -171,7 +190,8 @@ class TestModel:
         estimator = load("box", folder)
         assert estimator.card["calibration"]["frames"] == 640
         assert estimator.card["plausibility"]["frames"] == 3 * 640
-        assert "plausibility" in estimator.variables["params"]
+        assert {"plausibility", "hypotheses"} < set(estimator.variables["params"])
+        assert estimator.card["hypotheses"]["frames"] == 960
         assert estimator.card["calibration"]["noise"] == ["none"]  # no camera to choose
         file = tmp_path / "box.h5"
         generate = ["generate", "--category", "box", "--split", "test", "--frames", "200"]

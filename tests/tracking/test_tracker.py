@@ -333,6 +333,26 @@ def test_a_tracker_is_told_how_its_camera_is_turned():
     assert tracker.estimator.category == categories.get("box").rolled(180.0)
 
 
+def test_observations_carry_gravity():
+    tracker = toy()
+    cloud = plates(1)[0]
+    assert tracker.observe(cloud).gravity is None
+    np.testing.assert_allclose(tracker.observe(cloud, gravity=[0, 3, 4]).gravity, [0, 0.6, 0.8])
+    unknown = tracker.observe(cloud, gravity=np.zeros(3))
+    np.testing.assert_array_equal(unknown.gravity, 0.0)
+    with pytest.raises(CaperError, match="gravity"):
+        tracker.observe(cloud, gravity=[0, 1])
+    # Unknown gravity is as none at all; and a known one is heard.
+    begin = tracker.initial_state()
+    step = jax.jit(tracker.function)
+    results = [
+        step(tracker.estimator.variables, begin, frame)[1].pose.rotation
+        for frame in (tracker.observe(cloud), unknown, tracker.observe(cloud, gravity=[1, 0, 0]))
+    ]
+    np.testing.assert_allclose(results[1], results[0], atol=1e-4)
+    assert np.abs(results[2] - results[0]).max() > 0.01
+
+
 def test_slopes_remember_the_states_between_frames_alone():
     """Whatever a frame computes is computed again, so that long videos can be differentiated."""
     tracker = toy()

@@ -267,7 +267,7 @@ def test_demo_writes_pictures_and_a_page_and_prints_errors(tmp_path, monkeypatch
             evidence=np.zeros((1, 2, 12), np.float32),
         )
 
-    monkeypatch.setattr("caper_jax.estimator.load", lambda category: estimator)
+    monkeypatch.setattr("caper_jax.estimator.load", lambda category, **_: estimator)
     assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 0
     captured = capsys.readouterr()
     assert max(map(len, captured.out.splitlines()[:-2])) <= 80
