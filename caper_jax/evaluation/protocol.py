@@ -225,7 +225,8 @@ class _EstimatorStep:
 
 
 def _estimated_rows(variables, points, gravity, truth, shown, function, category) -> Estimates:
-    prediction = function(variables, points, gravity=gravity)
+    told = {} if gravity is None else {"gravity": gravity}
+    prediction = function(variables, points, **told)
     failed = ~(shown & is_finite(prediction.pose))
     arguments = prediction.pose, truth, category, failed
     symmetric = unchecked_errors_up_to_symmetry(*arguments) if category.symmetries else None
@@ -240,7 +241,7 @@ def _estimated_rows(variables, points, gravity, truth, shown, function, category
 
 
 def _readings(prediction: Prediction, truth, category: Category, failed) -> Readings | None:
-    stated = prediction.hypotheses
+    stated = getattr(prediction, "hypotheses", None)
     if stated is None:
         return None
 

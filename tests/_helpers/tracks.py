@@ -76,7 +76,7 @@ class KnownTracker:
     def reset(self, points=None, rotation=None, translation=None, labels=None) -> None:
         self.resets.append(points is not None)
 
-    def __call__(self, points, labels=None) -> TrackResult:
+    def __call__(self, points, labels=None, gravity=None) -> TrackResult:
         frame = self._frames[points.tobytes()]
         first = frame.name in self._first
         degrees, share = (90.0, 5.0) if first else (self._degrees, self._share)

@@ -48,7 +48,7 @@ class Scripted(Tracker):
         self.number = 0
         self.starts += points is not None
 
-    def __call__(self, points, labels=None):
+    def __call__(self, points, labels=None, gravity=None):
         index = self.number % len(self.pose.joint_state)
         pose = jax.tree.map(lambda array: array[index], self.pose)
         pose = pose.replace(translation=pose.translation + SHIFT * np.array([0, 0, 1], np.float32))

@@ -65,7 +65,7 @@ def estimator(monkeypatch):
 
     model = Known(function)
     model.card = {"mean_pose": MEAN_POSE}
-    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: model)
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *_, **__: model)
     return model
 
 
@@ -286,9 +286,10 @@ def test_the_worst_frames_are_named_and_drawn(path, tmp_path, monkeypatch, capsy
             plausible=yes,
             reason=0 * index,
             size_ratio=1.0 * yes,
+            hypotheses=None,
         )
 
-    monkeypatch.setattr("caper_jax.estimator.load", lambda *_: Known(function))
+    monkeypatch.setattr("caper_jax.estimator.load", lambda *_, **__: Known(function))
     assert run(path, tmp_path, "--worst", "2") == 0
     lines = capsys.readouterr().out.split("largest errors of rotation:")[1].splitlines()
     assert [line.split()[0] for line in lines[1:3]] == ["90.0", "60.0"]

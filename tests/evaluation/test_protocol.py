@@ -45,12 +45,11 @@ class Mean(Estimator):
 
     def __init__(self, truth):
         self.category, self.network, self.variables = BOX, NETWORK, {}
-        self.function = lambda variables, points, gravity: types.SimpleNamespace(
+        self.function = lambda variables, points: types.SimpleNamespace(
             pose=jax.tree.map(
                 lambda leaf: jnp.broadcast_to(leaf, (len(points), *leaf.shape)), truth
             ).replace(translation=jnp.broadcast_to(points.mean(1)[:, None], (len(points), 2, 3))),
             plausible=points[:, 0, 0] > 0,
-            hypotheses=None,
         )
 
 
