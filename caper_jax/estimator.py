@@ -7,7 +7,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import flax.linen as nn
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -21,22 +20,13 @@ from caper_jax.articulation.pose import Array, ArticulatedPose, joints_in_camera
 from caper_jax.config import NetworkConfig, from_dict
 from caper_jax.data.clouds import MIN_POINTS, are_sampled, sample_points
 from caper_jax.errors import CaperError
-from caper_jax.models import hypotheses as readings
 from caper_jax.models import uncertainty
-from caper_jax.models.files import CARD_FILE, flatten, read_model
-from caper_jax.models.hypotheses import MOST, Hypotheses, ReadingScorer, state_hypotheses
+from caper_jax.models.check_weights import check_variables
+from caper_jax.models.files import CARD_FILE, read_model
+from caper_jax.models.hypotheses import MOST, Hypotheses, state_hypotheses
 from caper_jax.models.observation import observe
-from caper_jax.models.parts import PartsNetwork
 from caper_jax.models.pipeline import articulated_pose, refinements, run_stages
-from caper_jax.models.plausibility import (
-    PlausibilityClassifier,
-    box_fit,
-    judge,
-    widening,
-)
-from caper_jax.models.plausibility import num_features as num_fit_features
-from caper_jax.models.refiner import BoxRefiner, num_features
-from caper_jax.models.root import RootNetwork
+from caper_jax.models.plausibility import box_fit, judge, widening
 from caper_jax.models.uncertainty import Calibration
 
 
@@ -402,7 +392,7 @@ def load(
     if not calibrated:
         card = {name: value for name, value in card.items() if name != "calibration"}
     network = network_of(card, directory)
-    _check_variables(directory, variables, definition, network)
+    check_variables(directory, variables, definition, network)
     definition = definition.scaled(object_scale).rolled(camera_roll)
     if hypotheses is None:
         hypotheses = MOST if "hypotheses" in variables["params"] else 1
@@ -420,50 +410,3 @@ def network_of(card: dict[str, Any], directory: Path) -> NetworkConfig:
     except (KeyError, TypeError) as error:
         raise CaperError(f"{directory / CARD_FILE} lacks run.network; train again") from error
     return from_dict(NetworkConfig, sizes, str(directory / CARD_FILE))
-
-
-def _check_variables(directory: Path, variables, category: Category, network: NetworkConfig):
-    """Raises CaperError unless the weights are those of the card's networks, leaf by leaf."""
-    points = jax.ShapeDtypeStruct((2, network.num_points, 3), jnp.float32)
-    parts = category.num_parts
-    modules: dict[str, tuple[nn.Module, Any, dict[str, Any]]] = {
-        "root": (RootNetwork(network), points, {"train": False}),
-        "parts": (PartsNetwork(network, parts), points, {"train": False}),
-    }
-    if network.refiner.width:
-        features = jax.ShapeDtypeStruct((2, num_features(parts)), jnp.float32)
-        modules["refiner"] = BoxRefiner(network.refiner.width, parts), features, {}
-    if "plausibility" in variables.get("params", {}):
-        features = jax.ShapeDtypeStruct((2, num_fit_features(parts)), jnp.float32)
-        modules["plausibility"] = PlausibilityClassifier(), features, {}
-    if "hypotheses" in variables.get("params", {}):
-        features = jax.ShapeDtypeStruct((2, readings.num_features(parts)), jnp.float32)
-        classes = np.zeros(2, np.int32)
-        modules["hypotheses"] = ReadingScorer(), features, {"rotation_class": classes}
-    collections = ["params", "batch_stats"]
-    try:
-        # Without a key: drawing random weights takes longer to trace than the networks.
-        shapes = {
-            name: jax.eval_shape(partial(module.apply, mutable=collections, **options), {}, inputs)[
-                1
-            ]
-            for name, (module, inputs, options) in modules.items()
-        }
-    except Exception as error:  # sizes that build no network; Flax and JAX raise many kinds
-        reason = str(error).strip().splitlines()[0]
-        raise CaperError(
-            f"{directory / CARD_FILE}: run.network is no network ({reason})"
-        ) from error
-    wanted = {
-        f"{collection}/{name}/{path}": leaf.shape
-        for name, variables_of in shapes.items()
-        for collection, tree in variables_of.items()
-        for path, leaf in flatten(tree).items()
-    }
-    found = {name: leaf.shape for name, leaf in flatten(variables).items()}
-    for name in sorted(wanted.keys() | found.keys()):
-        if wanted.get(name) != found.get(name):
-            raise CaperError(
-                f"{directory}: weights.npz does not fit the network in model.json: {name} is "
-                f"{found.get(name, 'absent')} there, {wanted.get(name, 'absent')} in the network"
-            )
