@@ -269,8 +269,9 @@ def _reliability(options: Options) -> Report:
         tables=[Table("Share of truths [%] inside the region stated to hold", header, rows, 3)],
         facts=[
             *facts,
-            "a region is a ball about the estimate, of a rotation vector, a position or a joint "
-            "state, of normally distributed errors with the stated deviation",
+            "a region is a ball about the estimate, of a rotation vector or a position, or an "
+            "interval of an extent or a joint state, of normally distributed errors with the "
+            "stated deviation",
             "of objects with a declared symmetry, the truth is the nearer of the equivalent poses",
             f"calibrated for {100 * COVERAGE:.0f} %; smaller and larger shares are as the normal "
             "distribution has them",
@@ -288,22 +289,35 @@ def measure_reliability(
 
     def predict(frames, points):
         prediction = estimator(points)
-        deviations = prediction.rotation_std, prediction.translation_std, prediction.state_std
+        deviations = (
+            *(prediction.rotation_std, prediction.translation_std, prediction.state_std),
+            prediction.size_std,  # None of models whose calibration is older
+        )
         stated.append(jax.tree.map(np.asarray, deviations))
         return prediction.pose
 
     num_points = estimator.network.num_points
     estimates = evaluate(dataset, predict, limit, num_points=num_points)
     # The first call was for the compiler; the last batch was filled up.
-    columns = zip(*stated[1:], strict=True)
-    deviations = [np.concatenate(column)[: len(estimates.names)] for column in columns]
+    rotation_std, translation_std, state_std, size_std = jax.tree.map(
+        lambda *batches: np.concatenate(batches)[: len(estimates.names)], *stated[1:]
+    )
     category = estimator.category
     truth = nearer_symmetry(estimates.estimate, estimates.truth, category)
     errors = pose_errors(estimates.estimate, truth, category, estimates.failed)
-    return _levels(category, errors, *deviations)
+    off = None if size_std is None else np.abs(estimates.estimate.size - truth.size)
+    return _levels(category, errors, rotation_std, translation_std, state_std, off, size_std)
 
 
-def _levels(category: Category, errors: PoseErrors, rotation_std, translation_std, state_std):
+def _levels(
+    category: Category,
+    errors: PoseErrors,
+    rotation_std,
+    translation_std,
+    state_std,
+    size_error,
+    size_std,
+):
     """What ``measure_reliability`` gives, from deviations in radians and meters."""
     levels, deviations = {}, {}
 
@@ -316,6 +330,9 @@ def _levels(category: Category, errors: PoseErrors, rotation_std, translation_st
         add("rotation", part, errors.rotation_deg[:, k], degrees, ball_share, 2, "deg")
         meters = translation_std[:, k]
         add("translation", part, errors.translation_m[:, k], meters, ball_share, 1, "mm", 1000)
+        if size_std is not None:  # the three extents together
+            extents = size_error[:, k].ravel(), size_std[:, k].ravel()
+            add("size", part, *extents, interval_share, 1, "mm", 1000)
     for j, kind in enumerate(category.joint_types):
         part, error, std = category.parts[j + 1], errors.state[:, j], state_std[:, j]
         if kind == "revolute":
