@@ -103,9 +103,8 @@ class ReadingScorer(Weights, nn.Module):
         for width in WIDTHS:
             hidden = nn.relu(Dense(width)(hidden))
         score, alone = jnp.moveaxis(Dense(2, kernel_init=nn.initializers.zeros)(hidden), -1, 0)
-        return sharpness[0] * (score + jnp.asarray(bias)[rotation_class]), sharpness[
-            1
-        ] * alone + shift
+        score = sharpness[0] * (score + jnp.asarray(bias)[rotation_class])
+        return score, sharpness[1] * alone + shift
 
 
 def num_features(num_parts: int) -> int:
