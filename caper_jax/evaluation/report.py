@@ -243,8 +243,9 @@ def write_report(folder: str | Path, evaluation: Evaluation, report: dict[str, A
     camera, meters), ``size``, ``box_center`` [F, K, 3] (rest frame of the part, meters),
     ``joint_axis``, ``joint_pivot`` [F, J, 3] (rest frame of the root), ``joint_state`` [F, J]
     (radians or meters), NaN where failed, and the ground truth under the same names with
-    ``truth_`` before; ``visibility`` [F, K] is NaN where unknown. Every error in metrics.json can
-    be computed from it.
+    ``truth_`` before; ``visibility`` [F, K] is NaN where unknown; of a model that states readings,
+    their ``probability`` [F, H] and ``reading_rotation_deg`` [F, H, K], the errors of their parts
+    up to symmetry. Every error in metrics.json can be computed from it.
 
     Args:
       folder: exists.
@@ -257,6 +258,9 @@ def write_report(folder: str | Path, evaluation: Evaluation, report: dict[str, A
         **({} if evaluation.plausible is None else {"plausible": evaluation.plausible}),
         "visibility": evaluation.visibility,
     }
+    if evaluation.readings is not None:
+        arrays["probability"] = np.asarray(evaluation.readings.probability)
+        arrays["reading_rotation_deg"] = np.asarray(evaluation.readings.rotation_deg)
     for prefix, pose in (("", evaluation.estimate), ("truth_", evaluation.truth)):
         for key, values in vars(pose).items():
             arrays[prefix + _SHORT.get(key, key)] = np.asarray(values)
