@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import pytest
 from _helpers.quick import traced_jit
-from _helpers.tiny import network, random_variables
+from _helpers.tiny import network, random_scorer, random_variables
 
 import caper_jax
 import caper_jax.evaluation.protocol  # its programs are jitted before a test replaces jax.jit
@@ -112,7 +112,9 @@ def resolve(name: str) -> object:
 def small_model() -> tuple[caper_jax.Category, NetworkConfig, Any]:
     """A box, and networks in the place of the shipped ones, which take longer to compile."""
     category, sizes = caper_jax.categories.get("box"), network(refine_steps=0)
-    return category, sizes, random_variables(category, sizes)
+    variables = random_variables(category, sizes)
+    variables["params"]["hypotheses"] = random_scorer()
+    return category, sizes, variables
 
 
 @named("page", [page for page in PAGES if blocks(page, "python")])
@@ -120,7 +122,7 @@ def test_python_blocks_run_in_order(page, small_model, tmp_path, monkeypatch):
     # Frames that are written must be such; of estimates nothing but the shape is looked at.
     if page.name not in ("datasets.md", "evaluating.md"):
         monkeypatch.setattr(jax, "jit", traced_jit)
-    estimator = caper_jax.Estimator(*small_model)
+    estimator = caper_jax.Estimator(*small_model, hypotheses=4)
     monkeypatch.setattr(caper_jax, "load", lambda *_, **__: estimator)
     tracker = caper_jax.Tracker(estimator, FEW_STEPS)
     monkeypatch.setattr(caper_jax, "load_tracker", lambda *_, **__: tracker)

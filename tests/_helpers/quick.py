@@ -16,4 +16,6 @@ def traced_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     def draw(leaf: jax.ShapeDtypeStruct) -> np.ndarray:
         return rng.uniform(0.5, 1.0, leaf.shape).astype(leaf.dtype)
 
-    return lambda *arguments: jax.tree.map(draw, jax.eval_shape(function, *arguments))
+    return lambda *arguments, **named: jax.tree.map(
+        draw, jax.eval_shape(function, *arguments, **named)
+    )

@@ -15,6 +15,7 @@ from caper_jax.config import (
     LossConfig,
     NetworkConfig,
 )
+from caper_jax.models.hypotheses import ReadingScorer, num_features
 from caper_jax.training.objective import Objective
 
 HS = HSEncoderConfig(channels=(4, 4, 8, 8, 16), neighbors=4, supports=2)
@@ -47,6 +48,15 @@ def random_like(shapes: Any, seed: int = 0) -> Any:
         return (rng.normal(size=leaf.shape) / np.sqrt(fan_in)).astype(np.float32)
 
     return jax.tree_util.tree_map_with_path(draw, shapes)
+
+
+def random_scorer(num_parts: int = 2, seed: int = 3) -> Any:
+    """The weights that state readings (``models.hypotheses``), as fitting would leave them."""
+    features = np.zeros((1, num_features(num_parts)), np.float32)
+    shapes = jax.eval_shape(
+        ReadingScorer().init, jax.random.key(0), features, np.zeros(1, np.int32)
+    )["params"]
+    return {**random_like(shapes, seed), "sharpness": np.ones(2, np.float32)}
 
 
 def random_variables(category: Category, config: NetworkConfig, seed: int = 0) -> Any:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _helpers.tiny import network, random_like, random_variables
+from _helpers.tiny import network, random_scorer, random_variables
 from scipy.spatial.transform import Rotation
 from scipy.special import softmax
 
@@ -24,21 +24,11 @@ from caper_jax.training import fit_hypotheses
 BOX = categories.get("box")
 
 
-def scorer(parts=2, seed=3):
-    shapes = jax.eval_shape(
-        ReadingScorer().init,
-        jax.random.key(0),
-        np.zeros((1, num_features(parts)), np.float32),
-        np.zeros(1, np.int32),
-    )["params"]
-    return {**random_like(shapes, seed), "sharpness": np.ones(2, np.float32)}
-
-
 @pytest.fixture(scope="module")
 def model():
     config = network("fast", pool_first=True)
     variables = random_variables(BOX, config)
-    variables["params"]["hypotheses"] = scorer()
+    variables["params"]["hypotheses"] = random_scorer()
     return config, variables
 
 
@@ -181,7 +171,7 @@ def made_up(samples, seed, shift=0.0):
 def test_fitted_probabilities_are_the_true_ones(monkeypatch):
     monkeypatch.setattr(fit_hypotheses, "_STEPS", 1000)
     monkeypatch.setattr(fit_hypotheses, "_DRAWN", 256)
-    params = scorer()
+    params = random_scorer()
     data, _ = made_up(6000, 0)
     fitted = fit_hypotheses.fit_scorer(params, data, 0)
     fitted = fit_hypotheses.with_temperatures(fitted, made_up(3000, 1)[0])

@@ -217,7 +217,7 @@ def test_increments_are_tracked_by_the_network_alone(trained, tmp_path, monkeypa
     output = capsys.readouterr().out
     assert cells(output, "box", "lie", "2")[:2] == ["4.00 ± 0.00", "4.00 ± 0.00"]
     label = "root rotation, mean [deg]"
-    assert cells(output, "box", "euclidean", label)[:2] == ["+1.00 *", "+1.00 to +1.00"]
+    assert cells(output, "box", "euclidean increments", label)[:2] == ["+1.00 *", "+1.00 to +1.00"]
     assert cells(output, "box", "base", "lie")[0] == "4.6"
 
 

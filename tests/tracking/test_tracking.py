@@ -329,9 +329,8 @@ class TestUpdateKeyframe:
                 def update(static, points, tracked, state, due, num_inconsistent, turned):
                     state, settings = SimpleNamespace(**state), TrackerConfig(**flags)
                     rest = due, num_inconsistent, turned, LAPTOP, None, settings
-                    return keyframes.update_keyframe(
-                        static, points, None, tracked, box_residual(tracked, points), state, *rest
-                    )
+                    known = static, points, None, None, tracked, box_residual(tracked, points)
+                    return keyframes.update_keyframe(*known, state, *rest)
 
                 programs[key] = jax.jit(update)
             points = in_camera(INSIDE, tracked if fits == "track" else static)
