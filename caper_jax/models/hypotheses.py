@@ -359,7 +359,7 @@ def in_words(result: Stated, category: Category) -> list[str]:
     others = possible_others(result)
     if not others and first > 1.0 - POSSIBLE:
         return []
-    lines = [f"this answer is right with {100 * first:.0f} %"]
+    lines = [f"probability that this is right: {100 * first:.0f} %"]
     rotation = np.asarray(result.hypotheses.pose.rotation, np.float64)[:, 0]
     for index in others:
         vector = Rotation.from_matrix(rotation[0].T @ rotation[index]).as_rotvec(degrees=True)
@@ -367,5 +367,5 @@ def in_words(result: Stated, category: Category) -> list[str]:
         axis = "xyz"[int(np.abs(vector).argmax())]
         chance = 100 * float(result.hypotheses.probability[index])
         turned = f"the {category.parts[0]} turned by {angle:.0f} deg about its {axis} axis"
-        lines.append(f"another reading has {chance:.0f} %: {turned}")
+        lines.append(f"another reading, with {chance:.0f} %: {turned}")
     return lines

@@ -159,8 +159,8 @@ def test_other_readings_and_gravity(files, monkeypatch, capsys):
     assert run(*IMAGE, "--mask", "mask.png", "--gravity", "0.1,1,0", *outputs) == 0
     assert told == [(0.1, 1.0, 0.0)]
     output = capsys.readouterr().out
-    assert "this answer is right with 70 %\n" in output
-    assert "another reading has 23 %: the base turned by 180 deg about its y axis\n" in output
+    assert "probability that this is right: 70 %\n" in output
+    assert "another reading, with 23 %: the base turned by 180 deg about its y axis\n" in output
     assert "2 %" not in output
     assert "of its size 4 x 4 x 4 mm" in output
     record = json.loads((files / "pose.json").read_text())
