@@ -127,7 +127,8 @@ def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
     for scene in scenes:
         print(f"\n{scene.name}\n{format_scene(scene)}")
     print(
-        f"\n{category.name}: {1000 * median(seconds):.1f} ms per frame (median of {len(seconds)}); "
+        f"\n{category.name}: {1000 * median(seconds):.1f} ms per frame (median of {len(seconds)}), "
+        "four looks at doubted ones included; "
         f"first call, with compilation, {first:.1f} s\n"
     )
     return scenes
