@@ -128,8 +128,8 @@ def _run_category(category: Category, folders: Sequence[Path]) -> list[Scene]:
         print(f"\n{scene.name}\n{format_scene(scene)}")
     print(
         f"\n{category.name}: {1000 * median(seconds):.1f} ms per frame (median of {len(seconds)}), "
-        "four looks at doubted ones included; "
-        f"first call, with compilation, {first:.1f} s\n"
+        "four looks at\n"
+        f"doubted ones included; first call, with compilation, {first:.1f} s\n"
     )
     return scenes
 
