@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from caper_jax.errors import CaperError
 
@@ -83,3 +84,28 @@ def _shape_text(shape: tuple[int | None, ...]) -> str:
     """(N, 3) for (None, 3)."""
     axes = ["N" if length is None else str(length) for length in shape]
     return f"({', '.join(axes)}{',' if len(axes) == 1 else ''})"
+
+
+def unit_gravity(gravity: Any, batch: int) -> Float[np.ndarray, "B 3"]:
+    """Directions of gravity as unit vectors, one per cloud.
+
+    Args:
+      gravity: [3] or [B, 3], of any length.
+      batch: B.
+
+    Raises:
+      CaperError: another shape, or a vector that is zero or not finite.
+    """
+    try:
+        down = np.asarray(gravity, np.float64)
+        if down.shape[-1:] != (3,):
+            raise ValueError(f"got shape {down.shape}")
+        down = np.broadcast_to(down, (batch, 3))
+    except (TypeError, ValueError) as error:
+        raise CaperError(
+            f"gravity must be three numbers, or three for each of {batch} clouds ({error})"
+        ) from error
+    length = np.linalg.norm(down, axis=-1, keepdims=True)
+    if not (np.isfinite(length) & (length > 1e-6)).all():
+        raise CaperError(f"gravity must be a direction in the camera frame, got {down.tolist()}")
+    return (down / length).astype(np.float32)

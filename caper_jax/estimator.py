@@ -15,6 +15,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int, Shaped
 
 from caper_jax import categories
+from caper_jax.arrays import unit_gravity
 from caper_jax.articulation.category import Category
 from caper_jax.articulation.pose import Array, ArticulatedPose, joints_in_camera
 from caper_jax.config import NetworkConfig, from_dict
@@ -302,28 +303,6 @@ class Estimator:
                 for cloud, name in zip(clouds, names, strict=True)
             ]
         )
-
-
-def unit_gravity(gravity: Any, batch: int) -> Float[np.ndarray, "B 3"]:
-    """Directions of gravity as unit vectors, one per cloud.
-
-    Args:
-      gravity: [3] or [B, 3], of any length.
-      batch: B.
-
-    Raises:
-      CaperError: another shape, or a vector that is zero or not finite.
-    """
-    try:
-        down = np.broadcast_to(np.asarray(gravity, np.float64), (batch, 3))
-    except (TypeError, ValueError) as error:
-        raise CaperError(
-            f"gravity must be three numbers, or three for each of {batch} clouds ({error})"
-        ) from error
-    length = np.linalg.norm(down, axis=-1, keepdims=True)
-    if not (np.isfinite(length) & (length > 1e-6)).all():
-        raise CaperError(f"gravity must be a direction in the camera frame, got {down.tolist()}")
-    return (down / length).astype(np.float32)
 
 
 def _check_shape(shape: tuple[int, ...]) -> None:

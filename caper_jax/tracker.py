@@ -10,11 +10,12 @@ from typing import Any
 import jax
 import numpy as np
 
+from caper_jax.arrays import unit_gravity
 from caper_jax.articulation.category import Category
 from caper_jax.config import TrackerConfig, from_dict, override
 from caper_jax.data.clouds import FARTHEST_M, MIN_POINTS, as_cloud, sample_points, shows_object
 from caper_jax.errors import CaperError
-from caper_jax.estimator import Estimator, load, unit_gravity
+from caper_jax.estimator import Estimator, load
 from caper_jax.tracking.state import Observation, TrackerState
 from caper_jax.tracking.step import TrackResult, given_state, initial_state, track_step
 

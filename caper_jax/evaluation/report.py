@@ -23,6 +23,7 @@ from caper_jax.evaluation.metrics import (
 )
 from caper_jax.evaluation.protocol import Evaluation, Readings
 from caper_jax.files import write_atomically
+from caper_jax.models.hypotheses import RIGHT_DEG
 
 METRICS_FILE = "metrics.json"
 PREDICTIONS_FILE = "predictions.npz"
@@ -125,7 +126,7 @@ def reading_summary(readings: Readings, category: Category) -> dict[str, Any]:
     """
     probability = np.asarray(readings.probability, np.float64)
     first, worst = probability[:, 0], np.asarray(readings.rotation_deg).max(-1)
-    is_right = worst <= FLIPPED_DEG
+    is_right = worst <= RIGHT_DEG
     confident = first > CONFIDENT
     nearest = np.take_along_axis(
         np.asarray(readings.rotation_deg), worst.argmin(1)[:, None, None], axis=1
@@ -320,7 +321,7 @@ def _format_plausible(report: dict[str, Any]) -> list[str]:
 def _format_readings(readings: dict[str, Any]) -> list[str]:
     """What probabilities are worth, in lines of at most 80 columns."""
     text = (
-        f"answers right within {FLIPPED_DEG:.0f} deg: {100 * readings['right']:.1f} %; stated with "
+        f"answers right within {RIGHT_DEG:.0f} deg: {100 * readings['right']:.1f} %; stated with "
         f"over {100 * CONFIDENT:.0f} %: {100 * readings['confident']:.1f} %; wrong all the same: "
         f"{100 * readings['confident_and_wrong']:.2f} % of all frames; calibration error "
         f"{readings['calibration_error']:.3f}"

@@ -47,6 +47,7 @@ RIGHT_DEG = 30.0  # a reading is right where every part's rotation is nearer to 
 WIDTHS = (64, 32)  # of the hidden layers
 # An answer that is this certain by itself is not compared with others: most clouds cost no more.
 SETTLED = 0.995
+POSSIBLE = 0.1  # another reading of more than this probability is worth a word
 _SAME = np.radians(20.0)  # two readings nearer than that are one
 _NEVER = -40.0  # nats
 _LARGEST = 1e4
@@ -329,11 +330,8 @@ def _in_camera(
     )
 
 
-POSSIBLE = 0.1  # another reading of at least this probability is worth a word
-
-
 class Stated(Protocol):
-    """What ``other_readings_in_words`` reads of a prediction."""
+    """What ``in_words`` reads of a prediction."""
 
     hypotheses: Any
 

@@ -26,10 +26,9 @@ from caper_jax.models.pipeline import articulated_pose, refinements, run_stages
 from caper_jax.models.plausibility import box_fit
 from caper_jax.training.fit_uncertainty import (
     SPLIT,
-    disturbed,
     mixed_frames,
+    mixture,
     nearer_symmetry,
-    sensors_alone,
 )
 from caper_jax.training.small_fits import minimize
 
@@ -58,7 +57,7 @@ def fit_hypotheses(
         np.zeros((1, hypotheses.num_features(estimator.category.num_parts)), np.float32),
         np.zeros(1, np.int32),
     )["params"]
-    kinds = (config, sensors_alone(config), disturbed(config))
+    kinds = mixture(config)
     data = _measured(estimator, params, kinds, "train", frames, seed + _SEED)
     unseen = _measured(estimator, params, kinds, SPLIT, frames // 4, seed + _SEED)
     fitted = fit_scorer(params, data, seed)

@@ -43,8 +43,8 @@ from caper_jax.synthetic.frames import Generator
 from caper_jax.training.fit_uncertainty import (
     BATCH,
     SPLIT,
-    disturbed,
     mixed_frames,
+    mixture,
     sensors_alone,
 )
 from caper_jax.training.small_fits import minimize
@@ -90,7 +90,7 @@ def fit_plausibility(
         features, sizes = (np.concatenate(column)[:count] for column in zip(*rows, strict=True))
         return features, sizes
 
-    kinds = (config, sensors_alone(config), disturbed(config))
+    kinds = mixture(config)
     batches = list(mixed_frames(estimator, kinds, "train", frames, seed, "judging right objects"))
     right = np.concatenate([batch.points for batch in batches])
     clean = np.concatenate([batch.points for batch in batches[1::3]])

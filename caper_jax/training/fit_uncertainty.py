@@ -56,10 +56,9 @@ def calibrate(
     cameras = tuple(name for name in config.noise if name in CAMERAS) or config.noise
     config = replace(config, noise=cameras)
     measure = jax.jit(partial(_measure, estimator=estimator))
-    configs = (config, sensors_alone(config), disturbed(config))
     rows = [
         jax.device_get(measure(estimator.variables, batch))
-        for batch in mixed_frames(estimator, configs, SPLIT, frames, seed, "calibrating")
+        for batch in mixed_frames(estimator, mixture(config), SPLIT, frames, seed, "calibrating")
     ]
     columns = [np.concatenate(column)[:frames] for column in zip(*rows, strict=True)]
     evidence, seen, size_errors, *errors = columns
@@ -116,6 +115,11 @@ def disturbed(config: GeneratorConfig) -> GeneratorConfig:
         cable=0.1,
         few_points=0.5,
     )
+
+
+def mixture(config: GeneratorConfig) -> tuple[GeneratorConfig, ...]:
+    """What a model's word on its own estimates is fitted on: frames as given, and of both kinds."""
+    return config, sensors_alone(config), disturbed(config)
 
 
 def mixed_frames(

@@ -124,6 +124,7 @@ def test_the_shipped_models_see_with_any_roll(name):
         ((0, 1), "three numbers"),
         (np.ones((3, 3)), "each of 2 clouds"),
         ("down", "three numbers"),
+        (5.0, "three numbers"),
     ],
 )
 def test_what_is_no_direction_is_named(gravity, named):

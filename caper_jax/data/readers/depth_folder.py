@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from caper_jax.arrays import unit_gravity
 from caper_jax.data.clouds import MIN_POINTS, cloud_from_depth
 from caper_jax.data.images import read_depth, read_intrinsics, read_json, read_mask
 from caper_jax.data.readers.base import ALL, DatasetReader, natural_order
@@ -114,13 +115,9 @@ def _gravity(path: Path, name: str) -> np.ndarray | None:
     if vector is None:
         return None
     try:
-        down = np.asarray(vector, np.float64).reshape(3)
-        length = float(np.linalg.norm(down))
-    except (TypeError, ValueError):
-        length = np.nan
-    if not 1e-6 < length < np.inf:
-        raise CaperError(f"{path}: gravity must be [x, y, z], a direction, got {vector}")
-    return down / length
+        return unit_gravity(vector, 1)[0]
+    except CaperError as error:
+        raise CaperError(f"{path}: gravity must be [x, y, z], a direction, got {vector}") from error
 
 
 def _videos_in(root: Path) -> list[Path]:
